@@ -1,0 +1,197 @@
+"""A part and its folder: everything the other packages know about a part is read here.
+
+A folder holds ``part.json``, ``source.step``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces),
+``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``, ``keypoints.json``, ``grasps.json``
+and ``preview.png``. Built-in parts live in ``cad/library``; a user's own in the folder that ``parts_dir`` or the
+environment variable ``TAGCELL_PARTS_DIR`` names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from cad.spatial import Array, rotation_z, transform
+
+LIBRARY = Path(__file__).parent / "library"
+PARTS_DIR_VARIABLE = "TAGCELL_PARTS_DIR"
+
+
+class CadError(Exception):
+    """Root of the errors that ``cad`` raises."""
+
+
+class PartError(CadError):
+    """A part that does not exist or whose folder is incomplete or inconsistent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StablePose:
+    """One way a part comes to rest on a plane.
+
+    ``R_table_part`` (3, 3) is the canonical orientation (yaw 0, table +z up), ``t_table_part`` (3,) the position of the
+    part's origin when the centre of its bounding rectangle seen from above is at the table frame's origin, so that a
+    part at rest is ``T_board_part = planar(x, y, yaw) @ T_table_part``.
+    """
+
+    index: int
+    R_table_part: Array
+    t_table_part: Array
+    probability: float
+    view_class: int
+
+    @property
+    def T_table_part(self) -> Array:
+        """(4, 4) canonical resting transform."""
+        return transform(self.R_table_part, self.t_table_part)
+
+    @property
+    def height_m(self) -> float:
+        """Height of the part's origin above the table."""
+        return float(self.t_table_part[2])
+
+
+def planar(x: float, y: float, yaw: float) -> Array:
+    """(4, 4) transform of a motion in the table plane: rotate by ``yaw`` rad about z, then shift by (x, y) metres."""
+    return transform(rotation_z(yaw), [x, y, 0.0])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """A part as its folder describes it. Lengths in metres, mass in kilograms, frame ``part``."""
+
+    name: str
+    obj_id: int
+    folder: Path
+    mass_kg: float
+    material: str
+    rgba: tuple[float, float, float, float]
+    metallic: float
+    roughness: float
+    mesh: trimesh.Trimesh
+    symmetries: Array  # (S, 3, 3) proper rotations about the part's origin, identity first
+    stable_poses: tuple[StablePose, ...]
+    keypoints: Array  # (K, 3), K = 8 by farthest-point sampling
+    mesh_hash: str
+    sources: tuple[str, ...] = ()
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def hulls(self) -> tuple[trimesh.Trimesh, ...]:
+        """Convex pieces for contact, in frame ``part``."""
+        return tuple(load_mesh(p) for p in sorted((self.folder / "hulls").glob("*.ply")))
+
+    @cached_property
+    def grasps(self) -> list[dict[str, Any]]:
+        """Grasp candidates as stored in ``grasps.json`` (empty when the file is not there)."""
+        path = self.folder / "grasps.json"
+        return json.loads(path.read_text())["grasps"] if path.exists() else []
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Largest distance between two points of the part."""
+        v = self.mesh.convex_hull.vertices
+        return float(np.sqrt(((v[:, None] - v[None]) ** 2).sum(-1).max()))
+
+    @cached_property
+    def radius_m(self) -> float:
+        """Largest distance of a point of the part from the part's bounding-box centre."""
+        return float(np.linalg.norm(self.mesh.vertices - self.mesh.bounds.mean(axis=0), axis=1).max())
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """A triangle mesh as stored, vertices not merged, from PLY, STL or OBJ."""
+    mesh = trimesh.load(path, force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
+
+
+def hash_file(path: Path) -> str:
+    """First 16 hex digits of the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def parts_roots(parts_dir: Path | None = None) -> list[Path]:
+    """Folders searched for parts, the user's own first."""
+    own = parts_dir or (Path(os.environ[PARTS_DIR_VARIABLE]) if os.environ.get(PARTS_DIR_VARIABLE) else None)
+    return [own, LIBRARY] if own else [LIBRARY]
+
+
+def part_names(parts_dir: Path | None = None) -> list[str]:
+    """Names of all parts, ordered by obj_id."""
+    found: dict[str, int] = {}
+    for root in parts_roots(parts_dir):
+        for path in root.glob("*/part.json"):
+            found.setdefault(path.parent.name, int(json.loads(path.read_text())["obj_id"]))
+    return sorted(found, key=found.__getitem__)
+
+
+def load_part(name: str, parts_dir: Path | None = None) -> Part:
+    """Read the part called ``name``.
+
+    Raises PartError naming the parts there are when there is none of that name, or the file that is missing.
+    """
+    for root in parts_roots(parts_dir):
+        if (root / name / "part.json").exists():
+            return _read_folder((root / name).resolve())
+    known = ", ".join(part_names(parts_dir)) or "none"
+    raise PartError(f"no part is called {name!r}; parts there are: {known}")
+
+
+@lru_cache(maxsize=64)
+def _read_folder(folder: Path) -> Part:
+    info = json.loads((folder / "part.json").read_text())
+    mesh_path = folder / "mesh.ply"
+    if not mesh_path.exists():
+        raise PartError(f"part {folder.name!r} has no mesh.ply in {folder}")
+    mesh_hash = hash_file(mesh_path)
+    if info["mesh_hash"] != mesh_hash:
+        raise PartError(
+            f"{mesh_path} has hash {mesh_hash} but part.json was made for {info['mesh_hash']}; build the part again"
+        )
+    return Part(
+        name=info["name"],
+        obj_id=int(info["obj_id"]),
+        folder=folder,
+        mass_kg=float(info["mass_kg"]),
+        material=info["material"],
+        rgba=tuple(info["rgba"]),
+        metallic=float(info["metallic"]),
+        roughness=float(info["roughness"]),
+        mesh=load_mesh(mesh_path),
+        symmetries=_read_symmetries(folder / "symmetries.json"),
+        stable_poses=_read_stable_poses(folder / "stable_poses.json"),
+        keypoints=np.array(json.loads((folder / "keypoints.json").read_text())["keypoints_m"]),
+        mesh_hash=mesh_hash,
+        sources=tuple(info.get("sources", ())),
+        info=info,
+    )
+
+
+def _read_symmetries(path: Path) -> Array:
+    discrete = json.loads(path.read_text()).get("symmetries_discrete", []) if path.exists() else []
+    rotations = [np.eye(3)] + [np.reshape(s, (4, 4))[:3, :3] for s in discrete]
+    return np.array(rotations)
+
+
+def _read_stable_poses(path: Path) -> tuple[StablePose, ...]:
+    if not path.exists():
+        return ()
+    return tuple(
+        StablePose(
+            index=i,
+            R_table_part=np.array(p["R_table_part"]),
+            t_table_part=np.array(p["t_table_part_m"]),
+            probability=float(p["probability"]),
+            view_class=int(p.get("view_class", i)),
+        )
+        for i, p in enumerate(json.loads(path.read_text())["stable_poses"])
+    )

@@ -1,0 +1,1 @@
+"""From a camera frame to part poses: calibration, segmentation, keypoints, refinement. Imports no MuJoCo."""

@@ -1,0 +1,71 @@
+"""What perception says about a frame: plain data, importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cad.spatial import Array, Intrinsics
+
+ACCEPTED = "accepted"
+
+
+class PerceptionError(Exception):
+    """Root of the errors that ``perception`` raises."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One camera image: ``image`` (H, W, 3) uint8 RGB, its intrinsics and the time it was exposed, in seconds."""
+
+    image: NDArray[np.uint8]
+    intrinsics: Intrinsics
+    time_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartEstimate:
+    """One part seen in a frame.
+
+    ``covariance`` (6, 6) is of (translation m, rotation vector rad), both in ``cam``. ``verdict`` is "accepted" or the
+    reason why not. ``raw_T_cam_part`` is the pose before stable-pose, plane and contour refinement.
+    ``mask`` (h, w) bool covers the frame's pixels from ``mask_origin`` (u, v) on.
+    """
+
+    part: str
+    T_cam_part: Array
+    stable_pose: int
+    score: float
+    verdict: str = ACCEPTED
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    raw_T_cam_part: Array | None = None
+    mask: NDArray[np.bool_] | None = None
+    mask_origin: tuple[int, int] = (0, 0)
+    details: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the estimate may be acted on."""
+        return self.verdict == ACCEPTED
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameEstimate:
+    """All parts seen in a frame and the camera pose read from the tags in it."""
+
+    T_cam_board: Array
+    parts: tuple[PartEstimate, ...]
+    tags_seen: int
+    tag_rms_px: float
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class PoseEstimator(Protocol):
+    """Turns a frame into poses."""
+
+    def estimate(self, frame: Frame) -> FrameEstimate:
+        """Poses of every part in the frame; raises PerceptionError when the frame cannot be used at all."""
+        ...

@@ -1,0 +1,1 @@
+"""The MuJoCo world of the cell: physics, cameras, rendering and labelled data sets."""
