@@ -1,0 +1,55 @@
+# Tagcell's everyday commands. A fresh clone needs Python 3.11 or newer and make, nothing else.
+#   make pick   set-up and the main job: 5 scenes, 2 parts a class, scored      make test   set-up and tests
+#   make check  lint, types, import rules                                       make help   all of them
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+OUT    ?= runs/pick
+SCENES ?= 5
+SEED   ?= 0
+ESTIMATOR ?= learned
+
+.PHONY: help setup pick test test-slow check format cad clean
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n 's/^#   //p' Makefile
+	@echo "also: make setup, test-slow (the long tests), format, cad (rebuild the CAD; installs build123d), clean"
+	@echo "variables: OUT=$(OUT) SCENES=$(SCENES) SEED=$(SEED) ESTIMATOR=$(ESTIMATOR) PYTHON=$(PYTHON)"
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(f"Tagcell needs Python 3.11 or newer; {sys.executable} is {sys.version.split()[0]}. Run: make PYTHON=/path/to/python3.11" if sys.version_info < (3, 11) else 0)'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/tagcell doctor --fix
+	@touch $@
+
+setup: $(READY)
+
+pick: setup
+	$(BIN)/tagcell pick --scenes $(SCENES) --parts-per-class 2 --seed $(SEED) --estimator $(ESTIMATOR) --out $(OUT)
+
+test: setup
+	$(BIN)/python -m pytest
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+cad: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[cad]'
+	$(BIN)/python -m cad.models.build
+
+clean:
+	rm -rf $(VENV) build *.egg-info runs .pytest_cache .ruff_cache .import_linter_cache
