@@ -1,0 +1,206 @@
+"""The UR5e: Denavit-Hartenberg table, forward and inverse kinematics, limits and link inertias.
+
+Frame ``base`` is UR's own base frame (z up); frame ``i`` follows joint ``i`` in the standard Denavit-Hartenberg
+convention, ``T_(i-1)_i = Rz(q) Tz(d) Tx(a) Rx(alpha)``; frame 6 is the flange, +z out of it. With all joints at zero
+the arm is stretched along -x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cad.parts import CadError
+from cad.spatial import Array, inverse, wrap_angle
+
+
+class RobotModelError(CadError):
+    """A joint vector or kinematic table that the arm model cannot use."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DhTable:
+    """Standard Denavit-Hartenberg parameters of a six-joint arm: ``a`` and ``d`` in metres, ``alpha`` in rad."""
+
+    a: tuple[float, ...]
+    d: tuple[float, ...]
+    alpha: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        lengths = (len(self.a), len(self.d), len(self.alpha))
+        if lengths != (6, 6, 6):
+            raise RobotModelError(f"a, d, alpha have {lengths} entries; each needs 6, one a joint")
+
+
+UR5E = DhTable(
+    a=(0.0, -0.425, -0.3922, 0.0, 0.0, 0.0),
+    d=(0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996),
+    alpha=(np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0),
+)
+"""Nominal UR5e: Universal Robots, "DH parameters for calculations of kinematics and dynamics". A real arm adds its own
+calibrated deltas of up to about a millimetre."""
+
+JOINT_NAMES = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+BODY_NAMES = (
+    "ur5e_base",
+    "ur5e_shoulder",
+    "ur5e_upper_arm",
+    "ur5e_forearm",
+    "ur5e_wrist_1",
+    "ur5e_wrist_2",
+    "ur5e_wrist_3",
+)
+"""Body ``BODY_NAMES[i]`` is fixed to frame ``i``; ``ur5e_base`` to frame ``base``."""
+
+JOINT_RANGE_RAD = (-2 * np.pi, 2 * np.pi)
+"""Every joint turns +-360 degrees (UR5e data sheet)."""
+SPEED_LIMIT_RAD_S = (np.pi,) * 6
+"""180 degrees/s on every joint (UR5e data sheet)."""
+TORQUE_LIMIT_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
+"""Maximum joint torques (Universal Robots, "Max. joint torques")."""
+PAYLOAD_KG = 5.0
+"""UR5e data sheet."""
+REACH_M = 0.85
+"""UR5e data sheet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkInertia:
+    """Mass in kg, centre of mass (3,) in the link's frame, moments (3,) in kg m^2 about it along the frame's axes."""
+
+    mass_kg: float
+    com_m: tuple[float, float, float]
+    moments_kg_m2: tuple[float, float, float]
+
+
+def _cylinder(
+    mass_kg: float, com_m: tuple[float, float, float], axis: int, radius: float, length: float
+) -> LinkInertia:
+    """Moments of a solid cylinder of the published mass around the published centre of mass."""
+    across = mass_kg * (3 * radius**2 + length**2) / 12
+    moments = [across, across, across]
+    moments[axis] = mass_kg * radius**2 / 2
+    return LinkInertia(mass_kg=mass_kg, com_m=com_m, moments_kg_m2=(moments[0], moments[1], moments[2]))
+
+
+LINK_INERTIAS = (
+    _cylinder(3.761, (0.0, -0.02561, 0.00193), axis=1, radius=0.060, length=0.17),
+    _cylinder(8.058, (0.2125, 0.0, 0.11336), axis=0, radius=0.055, length=0.54),
+    _cylinder(2.846, (0.15, 0.0, 0.0265), axis=0, radius=0.045, length=0.48),
+    _cylinder(1.37, (0.0, -0.0018, 0.01634), axis=1, radius=0.042, length=0.13),
+    _cylinder(1.3, (0.0, 0.0018, 0.01634), axis=1, radius=0.042, length=0.12),
+    _cylinder(0.365, (0.0, 0.0, -0.001159), axis=2, radius=0.0375, length=0.045),
+)
+"""Links 1..6. Masses and centres of mass: Universal Robots, "DH parameters for calculations of kinematics and
+dynamics". Moments are ours: solid cylinders along each link's long axis, of the housings' outer size."""
+
+
+def forward_kinematics(q: ArrayLike, dh: DhTable = UR5E) -> Array:
+    """Frames ``T_base_link`` (7, 4, 4): entry 0 is the base (identity), entry i frame i, entry 6 the flange.
+
+    ``q`` (6,) in rad. Raises RobotModelError when ``q`` has another shape.
+    """
+    angles = _joint_vector(q)
+    frames = np.empty((7, 4, 4))
+    frames[0] = np.eye(4)
+    for i in range(6):
+        frames[i + 1] = frames[i] @ _dh_transform(angles[i], dh, i)
+    return frames
+
+
+def jacobian(q: ArrayLike, dh: DhTable = UR5E) -> Array:
+    """Geometric Jacobian (6, 6) of the flange in ``base``: rows are linear (m/rad), then angular velocity."""
+    frames = forward_kinematics(q, dh)
+    axes = frames[:6, :3, 2]
+    arms = frames[6, :3, 3] - frames[:6, :3, 3]
+    return np.concatenate([np.cross(axes, arms), axes], axis=1).T
+
+
+def inverse_kinematics(T_base_flange: Array, dh: DhTable = UR5E, *, q6_singular: float = 0.0) -> Array:
+    """All joint vectors (N, 6) in [-pi, pi) that put the flange at ``T_base_flange`` (4, 4); N is 0 to 8.
+
+    Closed form for arms whose joints 2, 3, 4 are parallel and whose last three axes meet pairwise (the UR family):
+    shoulder left/right, wrist up/down, elbow up/down. At the wrist singularity (sin q5 = 0) only q4 + q6 or q4 - q6 is
+    defined and q6 = ``q6_singular`` is taken. Out of reach gives N = 0.
+    Raises RobotModelError when ``dh`` is of another family.
+    """
+    _check_family(dh)
+    solutions = []
+    for q1 in _shoulder_angles(T_base_flange, dh):
+        T_1_flange = inverse(_dh_transform(q1, dh, 0)) @ T_base_flange
+        for q5, q6 in _wrist_angles(T_1_flange, q6_singular):
+            T_1_4 = T_1_flange @ inverse(_dh_transform(q5, dh, 4) @ _dh_transform(q6, dh, 5))
+            solutions += [[q1, q2, q3, q4, q5, q6] for q2, q3, q4 in _planar_angles(T_1_4, dh)]
+    return wrap_angle(np.reshape(solutions, (-1, 6)))
+
+
+def _joint_vector(q: ArrayLike) -> Array:
+    angles = np.asarray(q, dtype=np.float64)
+    if angles.shape != (6,):
+        raise RobotModelError(f"joint vector has shape {angles.shape}; it must be (6,), in rad, base to wrist 3")
+    return angles
+
+
+def _dh_transform(angle: float, dh: DhTable, i: int) -> Array:
+    c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(dh.alpha[i]), np.sin(dh.alpha[i])
+    return np.array(
+        [
+            [c, -s * ca, s * sa, dh.a[i] * c],
+            [s, c * ca, -c * sa, dh.a[i] * s],
+            [0.0, sa, ca, dh.d[i]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _check_family(dh: DhTable) -> None:
+    zeros = (dh.a[0], *dh.a[3:], dh.d[1], dh.d[2])
+    if any(zeros) or not np.allclose(dh.alpha, UR5E.alpha, rtol=0, atol=1e-12):
+        raise RobotModelError(
+            f"no closed form for a={dh.a}, d={dh.d}, alpha={dh.alpha}: a[0], a[3:], d[1], d[2] must be 0 and alpha "
+            f"{UR5E.alpha}; use a numeric solver for calibrated tables"
+        )
+
+
+def _shoulder_angles(T_base_flange: Array, dh: DhTable) -> list[float]:
+    """Both q1 that put the wrist centre (origin of frame 5) at distance d4 from the shoulder plane."""
+    x, y = (T_base_flange[:3, 3] - dh.d[5] * T_base_flange[:3, 2])[:2]
+    square = x**2 + y**2 - dh.d[3] ** 2
+    if square < 0:
+        return []
+    return [float(np.arctan2(y, x) + np.arctan2(dh.d[3], side * np.sqrt(square))) for side in (1, -1)]
+
+
+def _wrist_angles(T_1_flange: Array, q6_singular: float) -> list[tuple[float, float]]:
+    """Both (q5, q6). The z row of R_1_flange is (sin q5 cos q6, -sin q5 sin q6, cos q5)."""
+    u, v, w = T_1_flange[2, :3]
+    sine = float(np.hypot(u, v))
+    if sine < 1e-9:
+        return [(float(np.arctan2(0.0, w)), q6_singular)]
+    return [(float(np.arctan2(side * sine, w)), float(np.arctan2(-side * v, side * u))) for side in (1, -1)]
+
+
+def _planar_angles(T_1_4: Array, dh: DhTable) -> list[tuple[float, float, float]]:
+    """Both (q2, q3, q4) of the planar arm with links a2, a3 that ends at the origin of frame 4."""
+    x, y = T_1_4[:2, 3]
+    a2, a3 = dh.a[1], dh.a[2]
+    cosine = (x**2 + y**2 - a2**2 - a3**2) / (2 * a2 * a3)
+    if abs(cosine) > 1 + 1e-12:
+        return []
+    sine = np.sqrt(max(0.0, 1 - cosine**2))
+    total = np.arctan2(T_1_4[1, 0], T_1_4[0, 0])
+    found = []
+    for s3 in (sine, -sine):
+        q3 = np.arctan2(s3, cosine)
+        q2 = np.arctan2(y, x) - np.arctan2(a3 * s3, a2 + a3 * cosine)
+        found.append((float(q2), float(q3), float(total - q2 - q3)))
+    return found
