@@ -1,0 +1,283 @@
+"""The referee: watches physics during a run and says of every part what happened to it.
+
+It never asks the controller anything; the controller's only influence is to mark where one attempt ends and the next
+begins. Rules (names and numbers): a part is *picked* when both pads held it, lowest point at least 50 mm above the
+board, for 1 s of simulated time; *placed* when at rest in a nest of its class within 0.3 mm and 3 degrees (modulo its
+proper symmetries), same face down as it was presented; it *succeeded* when picked and placed, no other part moved by
+more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything but the part, the board under it
+and the nest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from cad.parts import Part, StablePose
+from cad.spatial import Array, rotation_angle, transform
+from scenes.workcell import CellConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """Tolerances of the definitions of success."""
+
+    lift_m: float = 0.050
+    hold_s: float = 1.0
+    hold_gap_s: float = 0.010  # contact may flicker this long between two solver steps without ending a hold
+    place_m: float = 0.3e-3
+    place_rad: float = np.radians(3.0)
+    disturb_m: float = 0.5e-3
+    disturb_rad: float = np.radians(2.0)
+    rest_speed: float = 1e-3  # m/s
+    rest_rate: float = 0.05  # rad/s
+    beside_m: float = 0.015  # the board "under the part" reaches this far from the part's centre
+
+
+@dataclass(kw_only=True)
+class PartRecord:
+    """What physics showed of one presented part."""
+
+    part: str
+    instance: int
+    T_world_presented: Array
+    stable_pose: int
+    attempts: int = 0
+    gripped: bool = False
+    picked: bool = False
+    placed: bool = False
+    nest: int | None = None
+    place_error_m: float | None = None
+    place_error_rad: float | None = None
+    disturbed: list[str] = field(default_factory=list)
+    collisions: list[str] = field(default_factory=list)
+    moved_by_others: bool = False
+    hold_s: float = 0.0
+
+    @property
+    def succeeded(self) -> bool:
+        """Picked and placed, with nothing else moved or touched."""
+        return self.picked and self.placed and not self.disturbed and not self.collisions
+
+
+ROBOT, LEFT_PAD, RIGHT_PAD, BOARD, TRAY, OTHER = -1, -2, -3, -4, -5, -6
+_KIND_NAMES = {BOARD: "board", TRAY: "tray", OTHER: "table or stand"}
+
+
+def nearest_stable_pose(part: Part, R_table_part: Array) -> tuple[StablePose, float]:
+    """The stable pose whose downward direction is nearest to that of ``R_table_part``, and the angle between in rad."""
+
+    def tilt(pose: StablePose) -> float:
+        up = R_table_part[2]  # table's +z in the part frame
+        return min(
+            float(np.arctan2(np.linalg.norm(np.cross(up, u)), up @ u))
+            for u in (pose.R_table_part[2] @ s for s in part.symmetries)
+        )
+
+    best = min(part.stable_poses, key=tilt)
+    return best, tilt(best)
+
+
+def pose_difference(part: Part, T_target: Array, T_actual: Array) -> tuple[float, float]:
+    """Distance in m between the origins and angle in rad between the orientations, modulo the proper symmetries."""
+    distance = float(np.linalg.norm(T_actual[:3, 3] - T_target[:3, 3]))
+    angle = min(rotation_angle(T_target[:3, :3] @ s, T_actual[:3, :3]) for s in part.symmetries)
+    return distance, angle
+
+
+class Referee:
+    """Watches one scene. Call ``watch`` after every physics step and ``begin_attempt`` before every attempt."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        config: CellConfig,
+        parts: Sequence[Part],
+        rules: Rules | None = None,
+    ) -> None:
+        """``parts[i]`` is the class of part instance ``i`` (body ``part_{i:02d}``); the parts lie at rest."""
+        self._model, self._data, self._config, self._parts = model, data, config, list(parts)
+        self._rules = rules or Rules()
+        self._bodies = np.array([model.body(f"part_{i:02d}").id for i in range(len(parts))])
+        self._dofs = np.array([model.joint(f"part_{i:02d}").dofadr[0] for i in range(len(parts))])
+        self._tcp = model.site("tcp").id
+        self._kind = self._classify_geoms()
+        self._hull = [p.mesh.convex_hull.vertices for p in parts]
+        self._board_z = float(config.T_world_board[2, 3])
+        self._nests = {p.name: config.nest_frames(p.name) for p in parts}
+        self.records = [self._present(i) for i in range(len(parts))]
+        self._held_since = np.full(len(parts), np.nan)
+        self._held_last = np.full(len(parts), -np.inf)
+        self._open = False
+
+    def poses(self) -> Array:
+        """``T_world_part`` (N, 4, 4) of all part instances now."""
+        return np.array([self._pose(i) for i in range(len(self._parts))])
+
+    def begin_attempt(self) -> None:
+        """Close the attempt before, if any, and open a new one."""
+        self._close_attempt()
+        self._open = True
+        self._start = self.poses()
+        self._gripped: list[int] = []
+        self._touched: set[int] = set()
+        self._struck: dict[str, Array] = {}
+        self._lowest = (np.inf, np.zeros(3))
+
+    def watch(self) -> None:
+        """Look at the contacts of the step just made."""
+        data = self._data
+        if not self._open:
+            return
+        tcp = data.site_xpos[self._tcp]
+        if tcp[2] < self._lowest[0]:
+            self._lowest = (float(tcp[2]), tcp.copy())
+        if not data.ncon:
+            return
+        kinds = self._kind[data.contact.geom]  # (ncon, 2)
+        robot = (kinds <= ROBOT) & (kinds >= RIGHT_PAD)
+        rows = np.nonzero(robot.any(axis=1))[0]
+        pads: dict[int, set[int]] = {}
+        for row in rows:
+            if robot[row].all():
+                continue
+            mine, other = (0, 1) if robot[row, 0] else (1, 0)
+            tool, thing = int(kinds[row, mine]), int(kinds[row, other])
+            if thing >= 0:
+                self._touched.add(thing)
+                if tool in (LEFT_PAD, RIGHT_PAD):
+                    pads.setdefault(thing, set()).add(tool)
+            else:
+                self._strike(thing, data.contact.pos[row])
+        for i, sides in pads.items():
+            if len(sides) == 2:
+                self._hold(i)
+
+    def finish(self) -> list[PartRecord]:
+        """Close the last attempt and judge where every part lies; call once the world is at rest."""
+        self._close_attempt()
+        for i, record in enumerate(self.records):
+            self._judge_place(i, record)
+        return self.records
+
+    # -- during an attempt --------------------------------------------------------------------------------------
+
+    def _hold(self, i: int) -> None:
+        if i not in self._gripped:
+            self._gripped.append(i)
+            self.records[i].gripped = True
+        now, body = self._data.time, self._bodies[i]
+        z = self._hull[i] @ self._data.xmat[body].reshape(3, 3)[2] + self._data.xpos[body][2]
+        if z.min() < self._board_z + self._rules.lift_m:
+            return
+        if now - self._held_last[i] > self._rules.hold_gap_s or np.isnan(self._held_since[i]):
+            self._held_since[i] = now
+        self._held_last[i] = now
+        record = self.records[i]
+        record.hold_s = max(record.hold_s, now - self._held_since[i])
+        record.picked |= record.hold_s >= self._rules.hold_s
+
+    def _strike(self, thing: int, point: Array) -> None:
+        name = _KIND_NAMES[thing]
+        if name not in self._struck:
+            self._struck[name] = np.empty((0, 3))
+        if len(self._struck[name]) < 64:
+            self._struck[name] = np.vstack([self._struck[name], point])
+
+    # -- between attempts ---------------------------------------------------------------------------------------
+
+    def _close_attempt(self) -> None:
+        if not self._open:
+            return
+        self._open = False
+        end = self.poses()
+        target = self._gripped[0] if self._gripped else self._nearest(self._lowest[1], self._start)
+        moved = [
+            i
+            for i in range(len(self._parts))
+            if i != target and self._has_moved(self._parts[i], self._start[i], end[i])
+        ]
+        for i in moved:
+            self.records[i].moved_by_others = True
+        if target is None:
+            return
+        record = self.records[target]
+        record.attempts += 1
+        record.disturbed += [f"part_{i:02d}" for i in moved]
+        record.collisions += [f"part_{i:02d}" for i in sorted(self._touched - {target})]
+        record.collisions += self._forbidden(target)
+
+    def _has_moved(self, part: Part, T_before: Array, T_after: Array) -> bool:
+        distance, angle = pose_difference(part, T_before, T_after)
+        return distance > self._rules.disturb_m or angle > self._rules.disturb_rad
+
+    def _nearest(self, p_world: Array, poses: Array) -> int | None:
+        distance = np.linalg.norm(poses[:, :2, 3] - p_world[:2], axis=1)
+        i = int(distance.argmin())
+        return i if distance[i] < self._rules.beside_m else None
+
+    def _forbidden(self, target: int) -> list[str]:
+        """Names of the things the robot struck, other than the board under the part and the nest."""
+        out = []
+        for name, points in self._struck.items():
+            if name == "board":
+                allowed = self._start[target][None, :2, 3]
+            elif name == "tray":
+                allowed = self._nests[self._parts[target].name][:, :2, 3]
+            else:
+                out.append(name)
+                continue
+            distance = np.linalg.norm(points[:, None, :2] - allowed[None], axis=-1).min(axis=1)
+            if (distance > self._rules.beside_m).any():
+                out.append(name)
+        return out
+
+    # -- judging ------------------------------------------------------------------------------------------------
+
+    def _judge_place(self, i: int, record: PartRecord) -> None:
+        part, T = self._parts[i], self._pose(i)
+        pose = part.stable_poses[record.stable_pose]
+        errors = [pose_difference(part, T_nest @ pose.T_table_part, T) for T_nest in self._nests[part.name]]
+        n = int(np.argmin([e[0] for e in errors]))
+        speed = self._data.qvel[self._dofs[i] : self._dofs[i] + 6]
+        at_rest = (
+            np.linalg.norm(speed[:3]) < self._rules.rest_speed and np.linalg.norm(speed[3:]) < self._rules.rest_rate
+        )
+        near = errors[n][0] < 0.02
+        record.nest = n if near else None
+        record.place_error_m, record.place_error_rad = errors[n] if near else (None, None)
+        record.placed = bool(at_rest and errors[n][0] <= self._rules.place_m and errors[n][1] <= self._rules.place_rad)
+
+    def _present(self, i: int) -> PartRecord:
+        T = self._pose(i)
+        pose, _ = nearest_stable_pose(self._parts[i], T[:3, :3])
+        return PartRecord(part=self._parts[i].name, instance=i, T_world_presented=T, stable_pose=pose.index)
+
+    def _pose(self, i: int) -> Array:
+        body = self._bodies[i]
+        return transform(self._data.xmat[body].reshape(3, 3).copy(), self._data.xpos[body].copy())
+
+    def _classify_geoms(self) -> np.ndarray:
+        model = self._model
+        kind = np.full(model.ngeom, OTHER)
+        part_of_body = {int(b): i for i, b in enumerate(self._bodies)}
+        for g in range(model.ngeom):
+            name = model.geom(g).name
+            body = int(model.geom_bodyid[g])
+            if body in part_of_body:
+                kind[g] = part_of_body[body]
+            elif name == "pad_left":
+                kind[g] = LEFT_PAD
+            elif name == "pad_right":
+                kind[g] = RIGHT_PAD
+            elif model.body(body).name.startswith(("ur5e_", "hande_")):
+                kind[g] = ROBOT
+            elif name.startswith("board"):
+                kind[g] = BOARD
+            elif name.startswith("tray"):
+                kind[g] = TRAY
+        return kind
