@@ -126,7 +126,7 @@ def grasp_in_camera(T_base_tcp: Array, T_base_board: Array, T_cam_board: Array) 
 
 
 def _pixel(p: Array) -> tuple[int, int]:
-    return int(round(float(p[0]))), int(round(float(p[1])))
+    return round(float(p[0])), round(float(p[1]))
 
 
 def _colour(part: PartEstimate) -> tuple[int, int, int]:

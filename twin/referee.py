@@ -4,8 +4,8 @@ It never asks the controller anything; the controller's only influence is to mar
 begins. Rules (names and numbers): a part is *picked* when both pads held it, lowest point at least 50 mm above the
 board, for 1 s of simulated time; *placed* when at rest in a nest of its class within 0.3 mm and 3 degrees (modulo its
 proper symmetries), same face down as it was presented; it *succeeded* when picked and placed, no other part moved by
-more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything but the part, the board under it
-and the nest.
+more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything but the part, the board under
+it and the nest.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 
 from cad.parts import Part, StablePose
 from cad.spatial import Array, rotation_angle, transform
+from scenes.gl import mujoco
 from scenes.workcell import CellConfig
 
 

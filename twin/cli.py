@@ -1,0 +1,190 @@
+"""The ``tagcell`` command: one frozen dataclass a verb, parsed by tyro.
+
+Heavy packages are imported by the verb that needs them, so that help and errors are quick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
+
+from cad.parts import CadError, load_part, part_names
+from perception.estimates import PerceptionError
+from scenes.errors import SceneError
+from twin.pick_config import PickConfig
+from twin.robot import TwinError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pick(PickConfig):
+    """Drop parts onto the board, perceive, pick and place them, and score every pick against physics.
+
+    Writes OUT/scorecard.json and OUT/frames/*.jpg.
+    """
+
+    json: bool = False
+    """Print the scorecard as JSON instead of the table."""
+
+    def run(self) -> None:
+        """Run the scenes and print the result."""
+        from twin.pick import run_pick
+        from twin.report import print_scorecard
+
+        fields = [f.name for f in dataclasses.fields(PickConfig)]
+        card = run_pick(PickConfig(**{name: getattr(self, name) for name in fields}), quiet=self.json)
+        if self.json:
+            print(json.dumps(card, indent=1))
+        else:
+            print_scorecard(card, self.out)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a labelled data set in BOP layout: crops of single parts, or windows of whole scenes."""
+
+    kind: Literal["crop", "scene"] = "crop"
+    """Crops of one part each, or windows of scenes with many parts."""
+    split: Literal["train", "val"] = "train"
+    """Which board textures, lights and camera heights to draw from."""
+    count: int = 1000
+    """Number of images."""
+    seed: int = 0
+    """Seed of everything that is drawn."""
+    jobs: int = os.cpu_count() or 1
+    """Worker processes."""
+    out: Path = Path("data/crops")
+    """Folder of the data set; a run that was stopped is taken up where it was."""
+    json: bool = False
+    """Print the manifest as JSON."""
+
+    def run(self) -> None:
+        """Generate what is missing of the data set."""
+        from scenes.generate import DatasetConfig, generate
+
+        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed)
+        manifest = generate(config, self.out, jobs=self.jobs)
+        if self.json:
+            print(json.dumps(manifest, indent=1))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train:
+    """Render the training data where it is missing and train all networks; resumes where it was stopped."""
+
+    data: Path = Path("data")
+    """Folder for the rendered data."""
+    out: Path = Path("runs/train")
+    """Folder for weights, checkpoints and curves; use it with `tagcell pick --weights`."""
+    minutes: float = 60.0
+    """Training time of all networks together, shared out between them; rendering comes on top."""
+    seed: int = 0
+    """Seed of the data and of the training."""
+    threads: int = os.cpu_count() or 1
+    """Threads that the networks train on."""
+    json: bool = False
+    """Print the paths of the weights as JSON."""
+
+    def run(self) -> None:
+        """Train everything."""
+        from twin.training import train_all
+
+        written = train_all(data=self.data, out=self.out, minutes=self.minutes, seed=self.seed, threads=self.threads)
+        if self.json:
+            print(json.dumps([str(p) for p in written]))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PartList:
+    """The parts there are."""
+
+    json: bool = False
+    """Print as JSON."""
+
+    def run(self) -> None:
+        """Print one line a part."""
+        from twin.report import print_parts
+
+        print_parts([load_part(name) for name in part_names()], as_json=self.json)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PartShow:
+    """One part: size, mass, symmetries, stable poses and grasps."""
+
+    name: Positional[str]
+    """Name of the part."""
+    json: bool = False
+    """Print as JSON."""
+
+    def run(self) -> None:
+        """Print the part."""
+        from twin.report import print_part
+
+        print_part(load_part(self.name), as_json=self.json)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """Parts: list them, show one."""
+
+    action: OmitSubcommandPrefixes[
+        Annotated[PartList, subcommand("list")] | Annotated[PartShow, subcommand("show", prefix_name=False)]
+    ]
+
+    def run(self) -> None:
+        """Run the chosen action."""
+        self.action.run()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Check what Tagcell needs of this machine and print what mends it."""
+
+    fix: bool = False
+    """Install what is missing, where this user may."""
+    json: bool = False
+    """Print as JSON."""
+
+    def run(self) -> None:
+        """Print versions and checks."""
+        from twin.doctor import doctor
+
+        report = doctor(fix=self.fix)
+        if self.json:
+            print(json.dumps(report, indent=1))
+        else:
+            print("\n".join(f"{name:24s} {value}" for name, value in report.items()))
+
+
+Verb = (
+    Annotated[Pick, subcommand("pick")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Part, subcommand("part")]
+    | Annotated[Doctor, subcommand("doctor")]
+)
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Entry point: exit 0 when done, 1 with one line on stderr for a known error, 2 for wrong usage, 130 for Ctrl-C."""
+    verb = tyro.cli(
+        OmitArgPrefixes[OmitSubcommandPrefixes[Verb]],  # type: ignore[valid-type]
+        prog="tagcell",
+        description="Tagcell: a digital twin of a small-part picking cell, from CAD to scored pick and place.",
+        args=arguments,
+    )
+    try:
+        verb.run()
+    except KeyboardInterrupt:
+        print("\ntagcell: stopped; what was finished is kept", file=sys.stderr)
+        sys.exit(130)
+    except (CadError, PerceptionError, SceneError, TwinError, OSError) as error:
+        print(f"tagcell: {error}", file=sys.stderr)
+        sys.exit(1)

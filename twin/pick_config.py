@@ -1,0 +1,50 @@
+"""Configuration of ``tagcell pick``."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from cad.parts import part_names
+
+
+@dataclass(frozen=True, kw_only=True)
+class PickConfig:
+    """What to drop, who looks, and where the results go."""
+
+    scenes: int = 5
+    """Scenes, each with fresh parts and a fresh camera placement."""
+    parts_per_class: int = 2
+    """Parts of each class in a scene."""
+    parts: tuple[str, ...] = ("inserted", "main", "top")
+    """Part classes to drop."""
+    seed: int = 0
+    """Seed of the scenes; the same seed gives the same scorecard."""
+    estimator: Literal["learned", "oracle"] = "learned"
+    """Who says where the parts are: the trained networks, or ground truth."""
+    weights: Path | None = None
+    """Folder of trained weights; the ones that come with Tagcell when left out."""
+    out: Path = Path("runs/pick")
+    """Folder for scorecard.json and the annotated frames."""
+    pictures: bool = True
+    """Save an annotated picture of every frame."""
+    jobs: int = os.cpu_count() or 1
+    """Scenes run side by side."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("scenes", 100_000), ("parts_per_class", 4), ("jobs", 256)):
+            value = getattr(self, name)
+            if not 1 <= value <= most:
+                raise ValueError(f"{name.replace('_', '-')} is {value}; it must be between 1 and {most}")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; it must not be negative")
+        known = part_names()
+        unknown = [p for p in self.parts if p not in known]
+        if unknown or not self.parts:
+            raise ValueError(
+                f"unknown part {', '.join(unknown) or '(none given)'}; parts there are: {', '.join(known)}"
+            )
+        if len(set(self.parts)) != len(self.parts):
+            raise ValueError(f"parts are {', '.join(self.parts)}; name each class once and use parts-per-class")

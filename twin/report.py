@@ -1,0 +1,120 @@
+"""Tables on the terminal: scorecards and parts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cad.parts import Part
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def print_scorecard(card: dict[str, Any], out: Path) -> None:
+    """Success with its bound, failures by cause, errors by part, cycle time."""
+    console = Console()
+    picks = card["picks"]
+    table = Table(title=f"{card['config']['estimator']} estimator, seed {card['config']['seed']}", title_justify="left")
+    for column in (
+        "part",
+        "presented",
+        "succeeded",
+        "rate",
+        "e_x mm",
+        "e_y mm",
+        "e_z mm",
+        "e_theta deg",
+        "branch right",
+    ):
+        table.add_column(column, justify="left" if column == "part" else "right")
+    names = [*dict.fromkeys(p["part"] for p in card["parts"]), "all"]
+    for name in names:
+        rows = [p for p in card["parts"] if name in ("all", p["part"])]
+        good = sum(p["succeeded"] for p in rows)
+        error = card["pose_error"].get(name, {})
+        right = card["pose_error_branch_right"].get(name, {})
+        table.add_row(
+            name,
+            str(len(rows)),
+            str(good),
+            f"{good / len(rows):.3f}",
+            *(_number(right.get(k, {}).get("mean")) for k in ("e_x_mm", "e_y_mm", "e_z_mm", "e_theta_deg")),
+            _number(error.get("branch_right")),
+            end_section=name == names[-2],
+        )
+    console.print(table)
+    console.print("errors: means over the parts of the first look whose class, face and yaw branch are right")
+    failures = ", ".join(f"{k} {v}" for k, v in card["failures"].items() if v) or "none"
+    console.print(
+        f"succeeded {picks['succeeded']} of {picks['presented']} presented "
+        f"(at least {picks['success_lower_95']:.3f} with 95 % confidence), {picks['retries']} retries; "
+        f"failures: {failures}"
+    )
+    place = card["place_error"]["all"]
+    console.print(
+        f"place error mean {_number(place['e_mm']['mean'])} mm, p95 {_number(place['e_mm']['p95'])} mm; "
+        f"cycle {_number(card['cycle_s']['mean'], 2)} s simulated, {card['picks_per_hour']:.0f} picks an hour"
+    )
+    console.print(f"{out / 'scorecard.json'}", soft_wrap=True)
+
+
+def print_parts(parts: Sequence[Part], *, as_json: bool) -> None:
+    """One line a part."""
+    if as_json:
+        print(json.dumps([_describe(p) for p in parts], indent=1))
+        return
+    table = Table()
+    for column in ("part", "obj_id", "size mm", "mass g", "material", "triangles", "stable poses", "grasps"):
+        table.add_column(column, justify="left" if column in ("part", "material") else "right")
+    for part in parts:
+        size = " x ".join(f"{1e3 * s:.2f}" for s in part.mesh.extents)
+        row = (part.obj_id, size, f"{1e3 * part.mass_kg:.3f}", part.material, len(part.mesh.faces))
+        table.add_row(part.name, *map(str, row), str(len(part.stable_poses)), str(len(part.grasps)))
+    Console().print(table)
+
+
+def print_part(part: Part, *, as_json: bool) -> None:
+    """Size, mass, symmetries, stable poses with their probabilities and number of grasps, sources."""
+    if as_json:
+        print(json.dumps(_describe(part), indent=1))
+        return
+    console = Console()
+    print_parts([part], as_json=False)
+    table = Table(title="stable poses", title_justify="left")
+    for column in ("face", "probability", "height mm", "up in the part frame", "grasps"):
+        table.add_column(column, justify="right")
+    for pose in part.stable_poses:
+        up = np.round(pose.R_table_part[2], 3)
+        count = sum(g["stable_pose"] == pose.index for g in part.grasps)
+        table.add_row(str(pose.index), f"{pose.probability:.3f}", f"{1e3 * pose.height_m:.3f}", str(up), str(count))
+    console.print(table)
+    console.print(
+        f"proper symmetries: {len(part.symmetries)} (the identity counted); mesh {part.mesh_hash}; {part.folder}"
+    )
+    for source in part.sources:
+        console.print(f"source: {source}")
+
+
+def _describe(part: Part) -> dict[str, Any]:
+    return {
+        "name": part.name,
+        "obj_id": part.obj_id,
+        "size_mm": [1e3 * float(s) for s in part.mesh.extents],
+        "mass_kg": part.mass_kg,
+        "material": part.material,
+        "mesh_hash": part.mesh_hash,
+        "symmetries": len(part.symmetries),
+        "stable_poses": [
+            {"index": p.index, "probability": p.probability, "height_m": p.height_m} for p in part.stable_poses
+        ],
+        "grasps": len(part.grasps),
+        "folder": str(part.folder),
+    }
