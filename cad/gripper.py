@@ -44,6 +44,8 @@ FINGER_LENGTH_M = 0.025
 """From the carriage to the tip."""
 FINGER_ROOT_THICKNESS_M = 0.008
 """Thickness along x where the finger leaves the carriage; tapers down to the blade."""
+FINGER_ROOT_WIDTH_M = 0.010
+"""Width along y where the finger leaves the carriage."""
 PAD_WIDTH_M = 0.006
 """Along y."""
 PAD_HEIGHT_M = 0.010
