@@ -131,10 +131,22 @@ class LinearPath:
     def at(self, time_s: float) -> Array:
         """``T_base_tcp`` (4, 4) at ``time_s``."""
         profile = self.profile
-        fraction = profile.at(time_s)[0] / profile.length if profile.length > 0.0 else 1.0
+        return self.at_share(profile.at(time_s)[0] / profile.length if profile.length > 0.0 else 1.0)
+
+    def at_share(self, share: float) -> Array:
+        """``T_base_tcp`` (4, 4) after a share in [0, 1] of the path."""
         start, end = self.T_base_start, self.T_base_end
-        R = start[:3, :3] @ rotation_from_rotvec(fraction * self.rotvec)
-        return transform(R, start[:3, 3] + fraction * (end[:3, 3] - start[:3, 3]))
+        R = start[:3, :3] @ rotation_from_rotvec(share * self.rotvec)
+        return transform(R, start[:3, 3] + share * (end[:3, 3] - start[:3, 3]))
+
+
+def speed_for(length: float, acceleration: float, duration_s: float) -> float:
+    """Speed at which a trapezoid over ``length`` takes ``duration_s``; infinite where it cannot be that quick.
+
+    From ``duration = length / speed + speed / acceleration``, the slower root.
+    """
+    discriminant = (acceleration * duration_s) ** 2 - 4 * acceleration * length
+    return float(acceleration * duration_s - np.sqrt(discriminant)) / 2 if discriminant > 0 else float("inf")
 
 
 def steps_per_period(period_s: float, step_s: float) -> int:

@@ -22,6 +22,10 @@ class RobotError(TwinError):
     """A motion that the robot refused or could not finish; the message says what was asked and why not."""
 
 
+class MotionRefused(RobotError):  # noqa: N818 - a refusal, as controllers call it
+    """A motion that the robot refused before anything moved: outside its limits, not finite, or below the table."""
+
+
 class GripState(Enum):
     """What the hand reports, after Robotiq's object-detection states."""
 

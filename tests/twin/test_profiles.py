@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cad.spatial import inverse, rotation_angle, rotation_from_rotvec, rotvec_from_rotation, transform
-from twin.profiles import JointPath, LinearPath, ProfileError, Trapezoid, sample_times, steps_per_period
+from twin.profiles import JointPath, LinearPath, ProfileError, Trapezoid, sample_times, speed_for, steps_per_period
 
 
 @pytest.mark.parametrize("length", [1e-6, 0.003, 0.1, 2.5])
@@ -75,3 +75,9 @@ def test_sample_times_cover_the_move():
     np.testing.assert_allclose(times, [0.002, 0.004, 0.006, 0.008, 0.010, 0.012])
     assert len(list(sample_times(0.01, 0.002))) == 5
     assert list(sample_times(0.0, 0.002)) == [0.002]
+
+
+def test_speed_for_a_duration():
+    speed = speed_for(0.7, 2.5, 1.3)
+    assert Trapezoid(length=0.7, speed=speed, acceleration=2.5).duration_s == pytest.approx(1.3)
+    assert speed_for(10.0, 1.0, 0.1) == np.inf

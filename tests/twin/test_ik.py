@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from cad.gripper import T_FLANGE_TCP
+from cad.robot import forward_kinematics
+from cad.spatial import apply, rotation_angle
+from scenes.workcell import CellConfig, build_arm
+from twin.ik import ArmIk, IkError, top_down
+
+CELL = CellConfig()
+
+
+@pytest.fixture(scope="module")
+def ik():
+    return ArmIk(build_arm(CELL).compile(), np.array(CELL.home_q))
+
+
+def test_forward_agrees_with_the_published_table(ik):
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(-np.pi, np.pi, (20, 6)):
+        np.testing.assert_allclose(ik.forward(q), forward_kinematics(q)[6] @ T_FLANGE_TCP, atol=1e-9)
+
+
+def random_targets(rng, count):
+    half = np.array(CELL.pick_area_half_m)
+    for _ in range(count):
+        x, y = apply(CELL.T_world_board, [*rng.uniform(-half, half), 0.0])[:2]
+        yield top_down(x, y, rng.uniform(0.005, 0.1), rng.uniform(-np.pi, np.pi))
+        nests = CELL.nest_frames(CELL.tray.classes[int(rng.integers(3))])
+        x, y = nests[int(rng.integers(len(nests))), :2, 3]
+        yield top_down(x, y, rng.uniform(0.012, 0.1), rng.uniform(-np.pi, np.pi))
+
+
+def test_top_down_targets_over_board_and_tray_converge(ik):
+    for T in random_targets(np.random.default_rng(1), 25):
+        reached = forward_kinematics(ik.solve(T))[6] @ T_FLANGE_TCP
+        assert np.linalg.norm(reached[:3, 3] - T[:3, 3]) < 1e-5
+        assert rotation_angle(reached[:3, :3], T[:3, :3]) < np.deg2rad(0.01)
+
+
+def test_mink_alone_converges_from_a_start_far_off(ik):
+    rng = np.random.default_rng(2)
+    for T in random_targets(rng, 10):
+        q = ik.refine(T, ik.solve(T) + rng.normal(0.0, 0.1, 6))
+        assert np.linalg.norm(ik.forward(q)[:3, 3] - T[:3, 3]) < 1e-5
+        assert rotation_angle(ik.forward(q)[:3, :3], T[:3, :3]) < np.deg2rad(0.01)
+
+
+def test_solution_is_the_branch_nearest_to_the_asked_joints(ik):
+    rng = np.random.default_rng(3)
+    for T in random_targets(rng, 5):
+        q = ik.solve(T)
+        np.testing.assert_allclose(ik.solve(T, q + rng.normal(0.0, 0.02, 6)), q, atol=1e-5)
+
+
+def test_jacobian_is_the_derivative(ik):
+    q, h = np.array(CELL.home_q), 1e-6
+    J = ik.jacobian(q)
+    for i in range(6):
+        step = np.eye(6)[i] * h
+        slope = (ik.forward(q + step)[:3, 3] - ik.forward(q - step)[:3, 3]) / (2 * h)
+        np.testing.assert_allclose(J[:3, i], slope, atol=1e-8)
+
+
+def test_joint_limits_are_a_half_turn_each_way(ik):
+    low, high = ik.joint_limits
+    np.testing.assert_allclose([low, high], [[-np.pi] * 6, [np.pi] * 6])
+
+
+def test_out_of_reach_is_said_with_the_pose(ik):
+    with pytest.raises(IkError, match=r"1\.5000.*out of the arm's reach"):
+        ik.solve(top_down(1.5, 0.0, 0.1, 0.0))
+    with pytest.raises(IkError, match="not finite"):
+        ik.solve(top_down(np.nan, 0.0, 0.1, 0.0))
+
+
+def test_no_convergence_is_said_with_the_residual(ik):
+    with pytest.raises(IkError, match=r"not reached.*mm and .* degrees are left"):
+        ik.refine(top_down(1.5, 0.0, 0.1, 0.0), np.array(CELL.home_q))

@@ -1,0 +1,240 @@
+"""The pick-and-place state machine: look, choose, approach, close, check the grip, lift, place, look again.
+
+It knows only what the robot, the camera and the estimator tell it, the parts' folders and the nominal calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cad.parts import Part, planar
+from cad.spatial import Array, inverse, rotation_angle, yaw_of
+from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionError, PoseEstimator
+from twin.actions import ActionFailed, Actions
+from twin.attempts import (
+    Attempt,
+    AttemptFinished,
+    AttemptStarted,
+    Calibration,
+    ControllerConfig,
+    Event,
+    Looked,
+    Outcome,
+)
+from twin.grasps import GraspChoice, GraspConfig, PlacedPart, choose_grasp, read_grasps
+from twin.ik import ArmIk, IkError
+from twin.robot import Camera, MotionRefused, Robot, RobotError, TwinError
+
+
+class ControllerError(TwinError):
+    """A run that cannot start or go on: a part without grasps or nests."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """An estimate brought down to the board plane, or the reason why it cannot be used."""
+
+    estimate: PartEstimate
+    placed: PlacedPart
+    problem: tuple[Outcome, str] | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """What an attempt will do: a candidate, its grasp, and the nest it goes to."""
+
+    candidate: Candidate
+    choice: GraspChoice
+    nest: int
+    T_base_part_at_nest: Array
+
+
+class PickController:
+    """Picks every part it can see and puts each into the next free nest of its class.
+
+    ``parts`` are the classes to handle by name; ``on_event`` is told of every look and attempt as they happen.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        camera: Camera,
+        estimator: PoseEstimator,
+        *,
+        ik: ArmIk,
+        parts: Mapping[str, Part],
+        calibration: Calibration,
+        config: ControllerConfig | None = None,
+        grasp_config: GraspConfig | None = None,
+        on_event: Callable[[Event], None] | None = None,
+    ) -> None:
+        missing = sorted(set(parts) - set(calibration.T_base_nests))
+        if missing:
+            raise ControllerError(f"no nests for {missing}; the calibration has {sorted(calibration.T_base_nests)}")
+        self._robot, self._camera, self._estimator, self._ik = robot, camera, estimator, ik
+        self._parts, self._calibration = dict(parts), calibration
+        self._grasps = {name: read_grasps(part) for name, part in parts.items()}
+        self._config, self._grasp_config = config or ControllerConfig(), grasp_config or GraspConfig()
+        self._on_event = on_event or (lambda event: None)
+        self._in_nests: dict[str, dict[int, PlacedPart]] = {name: {} for name in parts}
+        self._tries: list[Array] = []
+        self._actions = Actions(robot, ik, calibration, self._config)
+        self.attempts: list[Attempt] = []
+
+    def run(self) -> list[Attempt]:
+        """Look and pick until nothing is left that can be picked; returns every attempt and every part left behind.
+
+        Raises RobotError when the robot stops by itself in a move: somebody has to look at it first.
+        """
+        self._actions.park()
+        idle, left_behind = 0, []
+        for _ in range(self._config.max_looks):
+            seen = self._look()
+            plan, left_behind = self._choose(seen[1]) if seen else (None, left_behind)
+            if seen and plan:
+                idle = 0
+                self._attempt(plan, *seen)
+                continue
+            idle += 1
+            if idle >= self._config.idle_looks or (seen and not left_behind):
+                break
+        self.attempts += left_behind
+        return self.attempts
+
+    # -- look -----------------------------------------------------------------------------------------------------
+
+    def _look(self) -> tuple[Frame, FrameEstimate] | None:
+        """A frame taken now and what it shows; None when the frame cannot be used."""
+        frame = self._camera.capture()
+        try:
+            estimate = self._estimator.estimate(frame)
+        except PerceptionError:
+            return None
+        self._on_event(Looked(frame=frame, estimate=estimate))
+        return frame, estimate
+
+    def _candidates(self, estimate: FrameEstimate) -> list[Candidate]:
+        T_base_cam = self._calibration.T_base_board @ inverse(estimate.T_cam_board)
+        return [self._candidate(part, T_base_cam) for part in estimate.parts if part.part in self._parts]
+
+    def _candidate(self, estimate: PartEstimate, T_base_cam: Array) -> Candidate:
+        """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's."""
+        part, T_base_board = self._parts[estimate.part], self._calibration.T_base_board
+        resting = part.stable_poses[estimate.stable_pose].T_table_part
+        T_board_part = inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part
+        yaw = yaw_of(T_board_part[:3, :3] @ resting[:3, :3].T)
+        x, y = T_board_part[:2, 3] - (planar(0.0, 0.0, yaw) @ resting)[:2, 3]
+        flat = planar(x, y, yaw) @ resting
+        tilt = rotation_angle(flat[:3, :3], T_board_part[:3, :3])
+        off = T_board_part[2, 3] - flat[2, 3]
+        problem: tuple[Outcome, str] | None = None
+        if not estimate.accepted:
+            problem = "declined", estimate.verdict
+        elif tilt > self._config.plane_tolerance or abs(off) > self._config.plane_tolerance_m:
+            problem = (
+                "pose",
+                f"{1e3 * off:.2f} mm off the board and {np.degrees(tilt):.1f} degrees from its stable pose",
+            )
+        elif abs(x) > self._calibration.board_half_m[0] or abs(y) > self._calibration.board_half_m[1]:
+            problem = "pose", f"at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm on the board, outside the pick area"
+        placed = PlacedPart(part=part, T_base_part=T_base_board @ flat)
+        return Candidate(estimate=estimate, placed=placed, problem=problem)
+
+    # -- choose ---------------------------------------------------------------------------------------------------
+
+    def _choose(self, estimate: FrameEstimate) -> tuple[Plan | None, list[Attempt]]:
+        """The next part to pick, least tried and surest first, and what cannot be picked and why."""
+        candidates = self._candidates(estimate)
+        left_behind: list[Attempt] = []
+        for candidate in sorted(candidates, key=lambda c: (self._tries_at(c.placed), -c.estimate.score)):
+            problem = candidate.problem
+            if problem is None and self._tries_at(candidate.placed) >= self._config.tries_per_region:
+                problem = "grasp", f"gave up after {self._config.tries_per_region} tries"
+            plan = problem or self._plan(candidate, [c.placed for c in candidates if c is not candidate])
+            if isinstance(plan, Plan):
+                return plan, left_behind
+            left_behind.append(self._left_behind(candidate, *plan))
+        return None, left_behind
+
+    def _plan(self, candidate: Candidate, neighbours: list[PlacedPart]) -> Plan | tuple[Outcome, str]:
+        name, k = candidate.estimate.part, candidate.estimate.stable_pose
+        nests, filled = self._calibration.T_base_nests[name], self._in_nests[name]
+        nest = next((n for n in range(len(nests)) if n not in filled), None)
+        if nest is None:
+            return "place", f"all {len(nests)} nests of {name!r} are taken"
+        T_base_part_at_nest = nests[nest] @ candidate.placed.part.stable_poses[k].T_table_part
+        choice = choose_grasp(
+            candidate.placed,
+            neighbours,
+            T_base_part_at_nest,
+            [p for nests in self._in_nests.values() for p in nests.values()],
+            self._grasps[name][k],
+            self._ik.solve,
+            self._grasp_config,
+        )
+        if isinstance(choice, str):
+            return ("ik" if "reach" in choice else "grasp"), choice
+        return Plan(candidate=candidate, choice=choice, nest=nest, T_base_part_at_nest=T_base_part_at_nest)
+
+    def _tries_at(self, placed: PlacedPart) -> int:
+        here = placed.T_base_part[:2, 3]
+        return sum(bool(np.linalg.norm(here - there) < self._config.region_m) for there in self._tries)
+
+    def _left_behind(self, candidate: Candidate, outcome: Outcome, note: str) -> Attempt:
+        now = self._robot.observe().time_s
+        return Attempt(
+            part=candidate.estimate.part,
+            stable_pose=candidate.estimate.stable_pose,
+            T_base_part=candidate.placed.T_base_part,
+            outcome=outcome,
+            note=note,
+            tried=False,
+            number=self._tries_at(candidate.placed),
+            look_time_s=now,
+            start_s=now,
+            end_s=now,
+        )
+
+    # -- pick and place -------------------------------------------------------------------------------------------
+
+    def _attempt(self, plan: Plan, frame: Frame, estimate: FrameEstimate) -> None:
+        """Pick the planned part and place it, and say how that ended."""
+        placed, choice = plan.candidate.placed, plan.choice
+        self._tries.append(placed.T_base_part[:2, 3].copy())
+        attempt = Attempt(
+            part=placed.part.name,
+            stable_pose=choice.grasp.stable_pose,
+            T_base_part=placed.T_base_part,
+            number=self._tries_at(placed),
+            grasp=choice.grasp,
+            T_part_tcp=choice.T_part_tcp,
+            nest=plan.nest,
+            approach_opening_m=choice.openings_m[0],
+            look_time_s=frame.time_s,
+            start_s=self._robot.observe().time_s,
+        )
+        self._on_event(AttemptStarted(attempt=attempt, frame=frame, estimate=estimate))
+        try:
+            attempt = replace(attempt, opening_m=self._actions.pick(placed.T_base_part, choice))
+            self._actions.carry(plan.T_base_part_at_nest, choice)
+            # from here on the nest counts as taken, whatever happens
+            self._in_nests[placed.part.name][plan.nest] = replace(placed, T_base_part=plan.T_base_part_at_nest)
+            self._actions.place(plan.T_base_part_at_nest, choice)
+            attempt = replace(attempt, outcome="placed")
+        except ActionFailed as failure:
+            attempt = replace(attempt, outcome=failure.outcome, note=str(failure))
+        except (MotionRefused, IkError) as refusal:
+            attempt = replace(attempt, outcome="ik", note=str(refusal))
+        except RobotError as error:
+            self._finish(replace(attempt, outcome="collision", note=str(error)))
+            raise
+        self._actions.park()
+        self._finish(attempt)
+
+    def _finish(self, attempt: Attempt) -> None:
+        attempt = replace(attempt, end_s=self._robot.observe().time_s)
+        self.attempts.append(attempt)
+        self._on_event(AttemptFinished(attempt=attempt))

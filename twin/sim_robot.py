@@ -1,0 +1,311 @@
+"""The robot in simulation: UR's moveJ and moveL and the Hand-E's grip on a MuJoCo model of the cell.
+
+The robot owns the clock: its moves step the physics. What it observes is what a real controller would report: joint
+encoders, the TCP that nominal kinematics make of them, and the gripper's own opening and object detection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from cad import gripper, robot
+from cad.spatial import Array
+from scenes.gl import mujoco
+from scenes.workcell import CellConfig, build_arm
+from twin.ik import ArmIk, IkError
+from twin.profiles import JointPath, LinearPath, sample_times, steps_per_period
+from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
+
+GRIPPER_ACTUATOR = "hande"
+FINGER_JOINTS = ("hande_left", "hande_right")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimRobotConfig:
+    """Control period, limits and tolerances of the simulated controller; metres, radians, seconds."""
+
+    control_period_s: float = 0.002
+    """UR's e-Series controllers run at 500 Hz."""
+    max_joint_acceleration: float = 40.0
+    max_tool_speed: float = 3.0
+    max_tool_acceleration: float = 150.0
+    """Largest values that a UR accepts for moves (ur_rtde's own guards)."""
+    min_tcp_z_m: float = 0.0
+    """The table: no target or path may bring the TCP below it."""
+    knot_spacing_m: float = 0.002
+    """Linear moves are solved this densely and interpolated by a cubic spline in between."""
+    tracking_limit: float = 0.1
+    """A joint further than this from its path means that something is in the way: a protective stop."""
+    settle_error: float = 1e-5
+    settle_speed: float = 1e-3
+    settle_limit_s: float = 0.5
+    grip_reach_m: float = 0.3e-3
+    """An opening this close to the commanded one has been reached; otherwise the fingers hold something."""
+    grip_rest_speed: float = 0.5e-3
+    grip_rest_s: float = 0.02
+    grip_limit_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value) or (value <= 0 and name != "min_tcp_z_m"):
+                raise ValueError(f"{name} {value} must be finite and positive")
+
+
+class SimRobot:
+    """A UR5e with a Hand-E inside a compiled cell; implements :class:`twin.robot.Robot`.
+
+    ``on_step`` is called after every physics step. Raises ProfileError when the control period is not a whole multiple
+    of the model's time step. The arm holds the position it is in when the robot is made.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        cell: CellConfig,
+        config: SimRobotConfig | None = None,
+        *,
+        on_step: Callable[[], None] | None = None,
+    ) -> None:
+        self._model, self._data, self._config = model, data, config or SimRobotConfig()
+        self._steps = steps_per_period(self._config.control_period_s, float(model.opt.timestep))
+        self.on_step = on_step
+        self.ik = ArmIk(build_arm(cell).compile(), np.array(cell.home_q))
+        joints = [model.joint(name) for name in robot.JOINT_NAMES]
+        self._qpos = np.array([j.qposadr[0] for j in joints])
+        self._dofs = np.array([j.dofadr[0] for j in joints])
+        actuators = np.array([model.actuator(name).id for name in robot.JOINT_NAMES])
+        self._ctrl = model.actuator_ctrladr[actuators]
+        self._kp, self._kv = model.actuator_gainprm[actuators, 0], -model.actuator_biasprm[actuators, 2]
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in FINGER_JOINTS])
+        self._finger_dofs = np.array([model.joint(name).dofadr[0] for name in FINGER_JOINTS])
+        self._hand = model.actuator(GRIPPER_ACTUATOR).id
+        self._hand_ctrl = int(model.actuator_ctrladr[self._hand])
+        self._inertia = np.zeros(model.nv)
+        self._opening_target = self._opening
+        data.ctrl[self._hand_ctrl] = self._opening_target
+        self._q_target = data.qpos[self._qpos].copy()
+        self._command(self._q_target, np.zeros(6), np.zeros(6))
+
+    # -- Robot ----------------------------------------------------------------------------------------------------
+
+    def observe(self) -> RobotState:
+        """The latest measured state."""
+        q = self._data.qpos[self._qpos].copy()
+        return RobotState(
+            time_s=float(self._data.time),
+            q=q,
+            qd=self._data.qvel[self._dofs].copy(),
+            T_base_tcp=self.ik.forward(q),
+            opening_m=self._opening,
+            grip=self._grip_state(),
+        )
+
+    def move_j(self, q: Array, *, speed: float, acceleration: float) -> JointMove:
+        """See :class:`twin.robot.Robot`. Raises MotionRefused before anything moves, RobotError when it gets stuck."""
+        target = np.array(q, dtype=np.float64)
+        self._check_joint_move(target, speed, acceleration)
+        path = JointPath(q_start=self._q_target, q_end=target, speed=speed, acceleration=acceleration)
+        for fraction in np.linspace(0.0, 1.0, 20):
+            self._check_height(self.ik.forward(path.q_start + fraction * (target - path.q_start)))
+        self._follow(path.at, path.duration_s, target)
+        return JointMove(q=target, speed=speed, acceleration=acceleration, duration_s=path.duration_s)
+
+    def move_l(self, T_base_tcp: Array, *, speed: float, acceleration: float) -> LinearMove:
+        """See :class:`twin.robot.Robot`. Raises MotionRefused before anything moves, RobotError when it gets stuck."""
+        target = np.array(T_base_tcp, dtype=np.float64)
+        self._check_linear_move(target, speed, acceleration)
+        path = LinearPath(
+            T_base_start=self.ik.forward(self._q_target), T_base_end=target, speed=speed, acceleration=acceleration
+        )
+        profile = path.profile
+        if profile.length > 0.0:
+            spline = self._joint_spline(path)
+
+            def at(time_s: float) -> tuple[Array, Array, Array]:
+                s, ds, dds = (x / profile.length for x in profile.at(time_s))
+                slope = spline(s, 1)
+                return spline(s), slope * ds, spline(s, 2) * ds**2 + slope * dds
+
+            self._follow(at, profile.duration_s, spline(1.0))
+        return LinearMove(T_base_tcp=target, speed=speed, acceleration=acceleration, duration_s=profile.duration_s)
+
+    def grip(self, opening_m: float, *, force_n: float, speed: float) -> RobotState:
+        """See :class:`twin.robot.Robot`. The commanded opening runs at ``speed``, the fingers push with ``force_n``."""
+        self._check_grip(opening_m, force_n, speed)
+        self._model.actuator_forcerange[self._hand] = [-force_n, force_n]
+        start, period_s = float(self._data.ctrl[self._hand_ctrl]), self._config.control_period_s
+        distance = opening_m - start
+        self._opening_target = opening_m
+        for time_s in sample_times(abs(distance) / speed, period_s):
+            self._data.ctrl[self._hand_ctrl] = start + np.sign(distance) * min(abs(distance), speed * time_s)
+            self._period()
+        rest_s = waited_s = 0.0
+        while rest_s < self._config.grip_rest_s:
+            if waited_s > self._config.grip_limit_s:
+                raise RobotError(
+                    f"the fingers did not come to rest within {self._config.grip_limit_s} s after being sent to "
+                    f"{1e3 * opening_m:.2f} mm; they are at {1e3 * self._opening:.2f} mm"
+                )
+            self._period()
+            waited_s += period_s
+            rest_s = rest_s + period_s if self._finger_speed < self._config.grip_rest_speed else 0.0
+        self._check_finite()
+        return self.observe()
+
+    def stop(self) -> None:
+        """Stop all motion now: the arm and the fingers hold where they are."""
+        self._q_target = self._data.qpos[self._qpos].copy()
+        self._command(self._q_target, np.zeros(6), np.zeros(6))
+        self._opening_target = self._opening
+        self._data.ctrl[self._hand_ctrl] = self._opening_target
+
+    def wait(self, duration_s: float) -> None:
+        """Let simulated time pass while the robot holds still."""
+        for _ in range(round(duration_s / self._config.control_period_s)):
+            self._period()
+
+    # -- motion ---------------------------------------------------------------------------------------------------
+
+    def _follow(self, at: Callable[[float], tuple[Array, Array, Array]], duration_s: float, q_end: Array) -> None:
+        """Run along ``at`` (time -> q, qd, qdd, each (6,)) and settle at ``q_end`` (6,)."""
+        for time_s in sample_times(duration_s, self._config.control_period_s):
+            q, qd, qdd = at(time_s)
+            self._command(q, qd, qdd)
+            self._period()
+            self._check_tracking(q)
+        self._q_target = q_end.copy()
+        self._command(q_end, np.zeros(6), np.zeros(6))
+        waited_s = 0.0
+        while not self._settled(q_end):
+            if waited_s > self._config.settle_limit_s:
+                error = np.abs(self._data.qpos[self._qpos] - q_end).max()
+                self.stop()
+                raise RobotError(
+                    f"the arm did not settle within {self._config.settle_limit_s} s: a joint is still {error:.2e} rad "
+                    "away; something is in its way"
+                )
+            self._period()
+            waited_s += self._config.control_period_s
+        self._check_finite()
+
+    def _command(self, q: Array, qd: Array, qdd: Array) -> None:
+        """Set points of the servos, whose force is ``kp (ctrl - q) - kv qd``: speed and inertia are fed forward."""
+        acceleration = np.zeros(self._model.nv)
+        acceleration[self._dofs] = qdd
+        mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
+        self._data.ctrl[self._ctrl] = q + (self._kv * qd + self._inertia[self._dofs]) / self._kp
+
+    def _period(self) -> None:
+        """One control period of physics."""
+        if self.on_step is None:
+            mujoco.mj_step(self._model, self._data, self._steps)
+            return
+        for _ in range(self._steps):
+            mujoco.mj_step(self._model, self._data)
+            self.on_step()
+
+    def _joint_spline(self, path: LinearPath) -> CubicSpline:
+        """Joint angles over the share of a linear path in [0, 1]; every knot is solved before anything moves."""
+        profile = path.profile
+        shares = np.linspace(0.0, 1.0, max(4, int(np.ceil(profile.length / self._config.knot_spacing_m)) + 1))
+        knots = [self._q_target]
+        for share in shares[1:]:
+            T_base_tcp = path.at_share(float(share))
+            self._check_height(T_base_tcp)
+            try:
+                knots.append(self.ik.refine(T_base_tcp, knots[-1]))
+            except IkError as error:
+                raise MotionRefused(f"linear move refused: {error}") from error
+        spline = CubicSpline(shares, knots)
+        fastest = np.abs(spline(shares, 1)).max(axis=0) * profile.peak_speed / profile.length
+        if (fastest > robot.SPEED_LIMIT_RAD_S).any():
+            raise MotionRefused(
+                f"linear move refused: it needs joint speeds of {fastest.round(2)} rad/s, the limits are "
+                f"{np.round(robot.SPEED_LIMIT_RAD_S, 2)}; move slower or further from a singularity"
+            )
+        return spline
+
+    # -- the hand -------------------------------------------------------------------------------------------------
+
+    @property
+    def _opening(self) -> float:
+        return float(self._data.qpos[self._fingers].sum())
+
+    @property
+    def _finger_speed(self) -> float:
+        return float(np.abs(self._data.qvel[self._finger_dofs]).sum())
+
+    def _grip_state(self) -> GripState:
+        """Object detection as the Hand-E does it: fingers that rest short of the commanded opening hold something."""
+        short = self._opening - self._opening_target
+        if abs(short) <= self._config.grip_reach_m:
+            return GripState.AT_POSITION
+        if self._finger_speed > 20 * self._config.grip_rest_speed:
+            return GripState.MOVING
+        return GripState.CONTACT_CLOSING if short > 0 else GripState.CONTACT_OPENING
+
+    # -- checks ---------------------------------------------------------------------------------------------------
+
+    def _settled(self, q_end: Array) -> bool:
+        error = np.abs(self._data.qpos[self._qpos] - q_end).max()
+        speed = np.abs(self._data.qvel[self._dofs]).max()
+        return bool(error < self._config.settle_error and speed < self._config.settle_speed)
+
+    def _check_tracking(self, q: Array) -> None:
+        off = np.abs(self._data.qpos[self._qpos] - q)
+        if not (off <= self._config.tracking_limit).all():
+            self.stop()
+            raise RobotError(
+                f"protective stop: joints are {off.round(3)} rad off their path, more than "
+                f"{self._config.tracking_limit} rad; something is in the arm's way"
+            )
+
+    def _check_finite(self) -> None:
+        if not np.isfinite(self._data.qpos).all():
+            raise RobotError(f"the simulation diverged at {self._data.time:.3f} s: joint positions are not finite")
+
+    def _check_joint_move(self, q: Array, speed: float, acceleration: float) -> None:
+        if q.shape != (6,) or not np.isfinite(q).all():
+            raise MotionRefused(f"joint target {q} refused: it must be 6 finite angles in rad")
+        low, high = self.ik.joint_limits
+        if (q < low).any() or (q > high).any():
+            raise MotionRefused(f"joint target {q.round(4)} rad refused: limits are {low.round(4)} to {high.round(4)}")
+        _check_rates("joint", speed, robot.SPEED_LIMIT_RAD_S[0], acceleration, self._config.max_joint_acceleration)
+
+    def _check_linear_move(self, T_base_tcp: Array, speed: float, acceleration: float) -> None:
+        R = T_base_tcp[:3, :3] if T_base_tcp.shape == (4, 4) else np.full((3, 3), np.nan)
+        if not np.isfinite(T_base_tcp).all() or not np.allclose(R @ R.T, np.eye(3), atol=1e-6):
+            raise MotionRefused(f"tool target refused: it is no finite rigid transform:\n{T_base_tcp}")
+        self._check_height(T_base_tcp)
+        _check_rates("tool", speed, self._config.max_tool_speed, acceleration, self._config.max_tool_acceleration)
+
+    def _check_height(self, T_base_tcp: Array) -> None:
+        z = float(T_base_tcp[2, 3])
+        if z < self._config.min_tcp_z_m:
+            raise MotionRefused(
+                f"move refused: it would bring the TCP to z = {1e3 * z:.2f} mm, below the table at "
+                f"{1e3 * self._config.min_tcp_z_m:.2f} mm"
+            )
+
+    def _check_grip(self, opening_m: float, force_n: float, speed: float) -> None:
+        checks = (
+            ("opening", opening_m, (0.0, gripper.STROKE_M), "m"),
+            ("force", force_n, gripper.FORCE_RANGE_N, "N"),
+            ("speed", speed, gripper.SPEED_RANGE_M_S, "m/s"),
+        )
+        for name, value, (low, high), unit in checks:
+            if not low <= value <= high:
+                raise MotionRefused(f"grip {name} {value} {unit} refused: the Hand-E's range is {low} to {high} {unit}")
+
+
+def _check_rates(what: str, speed: float, max_speed: float, acceleration: float, max_acceleration: float) -> None:
+    if not 0 < speed <= max_speed or not 0 < acceleration <= max_acceleration:
+        raise MotionRefused(
+            f"{what} speed {speed} and acceleration {acceleration} refused: they must be above 0 and at most "
+            f"{max_speed:.3f} and {max_acceleration:.3f}"
+        )
