@@ -18,6 +18,8 @@ from cad.spatial import Array, inverse, rotation_angle, rotvec_from_rotation, tr
 from twin.robot import TwinError
 
 TCP_SITE = "tcp"
+BRANCH_WEIGHTS = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 1.0])
+"""What a radian of each joint counts for when the nearest branch is chosen: a big link outweighs a turn of the wrist."""
 
 
 class IkError(TwinError):
@@ -101,7 +103,7 @@ class ArmIk:
         branches = branches[((branches >= self._lower) & (branches <= self._upper)).all(axis=1)]
         if not len(branches):
             raise IkError(f"{_describe(T_base_tcp)} is out of the arm's reach: no closed-form branch reaches it")
-        return self.refine(T_base_tcp, branches[np.abs(branches - near).sum(axis=1).argmin()])
+        return self.refine(T_base_tcp, branches[(np.abs(branches - near) @ BRANCH_WEIGHTS).argmin()])
 
     def refine(self, T_base_tcp: Array, q_start: Array) -> Array:
         """Joint angles (6,) rad at ``T_base_tcp`` by iterating from ``q_start`` (6,). Raises IkError."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cad.parts import Part, StablePose
-from cad.spatial import Array, rotation_angle, transform
+from cad.spatial import Array, inverse, rotation_angle, transform
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig
 
@@ -56,6 +56,7 @@ class PartRecord:
     collisions: list[str] = field(default_factory=list)
     moved_by_others: bool = False
     hold_s: float = 0.0
+    T_tcp_part: Array | None = None  # how it lay in the hand when it counted as picked
 
     @property
     def succeeded(self) -> bool:
@@ -179,7 +180,10 @@ class Referee:
         self._held_last[i] = now
         record = self.records[i]
         record.hold_s = max(record.hold_s, now - self._held_since[i])
-        record.picked |= record.hold_s >= self._rules.hold_s
+        if not record.picked and record.hold_s >= self._rules.hold_s:
+            record.picked = True
+            T_world_tcp = transform(self._data.site_xmat[self._tcp].reshape(3, 3), self._data.site_xpos[self._tcp])
+            record.T_tcp_part = inverse(T_world_tcp) @ self._pose(i)
 
     def _strike(self, thing: int, point: Array) -> None:
         name = _KIND_NAMES[thing]

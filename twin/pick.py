@@ -1,0 +1,128 @@
+"""``tagcell pick``: many scenes side by side, one scorecard."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from cad.parts import hash_file, load_part
+from perception.estimates import PoseEstimator
+from twin.doctor import versions
+from twin.pick_config import PickConfig
+from twin.robot import TwinError
+from twin.scorecard import SceneResult, build_scorecard, write_json
+
+
+def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
+    """Run all scenes and write ``scorecard.json``; returns the scorecard.
+
+    Raises TwinError when ``out`` cannot be written and PerceptionError when weights are missing, before any scene runs.
+    """
+    _check_writable(config.out)
+    weights = check_weights(config)
+    with Progress(
+        TextColumn("picking"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("scenes  {task.fields[placed]} of {task.fields[presented]} parts succeeded"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        disable=quiet,
+    ) as progress:
+        task = progress.add_task("picking", total=config.scenes, placed=0, presented=0)
+        results: list[SceneResult] = []
+        for result in _run_scenes(config):
+            results.append(result)
+            parts = [p for r in results for p in r.parts]
+            progress.update(task, advance=1, placed=sum(p.succeeded for p in parts), presented=len(parts))
+    results.sort(key=lambda r: r.scene)
+    card = build_scorecard(
+        results,
+        config=config_json(config),
+        seed=config.seed,
+        versions=versions(),
+        weights=weights,
+        meshes={name: load_part(name).mesh_hash for name in config.parts},
+    )
+    write_json(config.out / "scorecard.json", card)
+    return card
+
+
+def run_scene(config: PickConfig, scene: int) -> SceneResult:
+    """One scene, from (seed, scene) alone."""
+    from scenes.workcell import CellConfig
+    from twin.scene_trial import SceneTrial
+
+    return SceneTrial(config, scene, _estimator(config), CellConfig()).run()
+
+
+def config_json(config: PickConfig) -> dict[str, Any]:
+    """The configuration without what cannot change the result."""
+    values = dataclasses.asdict(config)
+    for name in ("out", "jobs", "pictures"):
+        del values[name]
+    return values | {"weights": str(config.weights) if config.weights else None, "parts": list(config.parts)}
+
+
+def check_weights(config: PickConfig) -> dict[str, str]:
+    """Hashes of the weight files a run will use; raises PerceptionError when one is missing or does not fit."""
+    if config.estimator == "oracle":
+        return {}
+    _estimator(config)
+    from perception.estimator import WEIGHTS
+
+    folder = config.weights or WEIGHTS
+    return {p.name: hash_file(p) for p in sorted(folder.glob("*.safetensors"))}
+
+
+_ESTIMATORS: dict[PickConfig, PoseEstimator] = {}
+
+
+def _estimator(config: PickConfig) -> PoseEstimator | None:
+    """The learned estimator, loaded once a process; None stands for the oracle."""
+    if config.estimator == "oracle":
+        return None
+    if config not in _ESTIMATORS:
+        import torch
+
+        from perception.estimator import LearnedEstimator
+
+        torch.set_num_threads(1)  # sums must not depend on how many scenes run side by side
+        _ESTIMATORS[config] = LearnedEstimator(config.weights, part_names=config.parts)
+    return _ESTIMATORS[config]
+
+
+def _run_scenes(config: PickConfig) -> Iterator[SceneResult]:
+    jobs = min(config.jobs, config.scenes)
+    if jobs == 1:
+        for scene in range(config.scenes):
+            yield run_scene(config, scene)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, mp_context=context)
+    try:
+        pending = [pool.submit(run_scene, config, scene) for scene in range(config.scenes)]
+        for future in as_completed(pending):
+            yield future.result()
+        pool.shutdown()
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+        raise
+
+
+def _check_writable(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".tagcell"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise TwinError(f"cannot write to {out} ({error.strerror}); choose another folder with --out") from error
