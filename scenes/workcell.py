@@ -18,7 +18,7 @@ from scenes.contacts import BOX, PART, Touches, add_primitive, make_collision, s
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_part_material, add_visual, classic_finish
 
-__all__ = ["CellConfig", "TrayConfig", "build_arm", "build_workcell", "part_body", "set_parts"]
+__all__ = ["CellConfig", "TrayConfig", "build_arm", "build_board_scene", "build_workcell", "part_body", "set_parts"]
 
 OVERVIEW = "overview"
 """Camera that sees the whole cell from the side."""
@@ -30,13 +30,22 @@ SHADOW_SIZE = 4096
 def build_workcell(config: CellConfig, part_names: Sequence[str]) -> mujoco.MjSpec:
     """The cell with one free body for each name in ``part_names``; instance i is body ``part_0i``.
 
-    Raises PartError for a name that is not a part. Parts start stowed beside the table; see :func:`set_parts`.
+    The arm's joints come first in ``qpos``, then the fingers', then the parts'. Raises PartError for a name that is not
+    a part. Parts start stowed beside the table; see :func:`set_parts`.
     """
-    spec = build_board_scene(config, part_names)
+    spec = _start(config)
     _add_station(spec, config)
     _add_robot(spec, config)
     _add_cell_visuals(spec, config)
     _add_overview(spec)
+    _add_parts(spec, config, part_names)
+    return spec
+
+
+def build_board_scene(config: CellConfig, part_names: Sequence[str]) -> mujoco.MjSpec:
+    """Board, camera, lights and parts without table and robot: what settling parts and looking at them needs."""
+    spec = _start(config)
+    _add_parts(spec, config, part_names)
     return spec
 
 
@@ -49,8 +58,7 @@ def build_arm(config: CellConfig) -> mujoco.MjSpec:
     return spec
 
 
-def build_board_scene(config: CellConfig, part_names: Sequence[str]) -> mujoco.MjSpec:
-    """Board, camera, lights and parts without table and robot: what placement and rendering tests need."""
+def _start(config: CellConfig) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "cell"
     set_options(spec, config.timestep_s)
@@ -58,15 +66,18 @@ def build_board_scene(config: CellConfig, part_names: Sequence[str]) -> mujoco.M
     board = _add_board(spec, config)
     add_camera(board, config.intrinsics, config.T_board_cam)
     _add_lights(board)
-    for name in dict.fromkeys(part_names):
-        part = load_part(name, config.parts_dir)
-        add_mesh(spec, f"{name}_visual", part.mesh)
-        add_part_material(spec, name, part)
-        for k, hull in enumerate(part.hulls):
-            _add_hull(spec, f"{name}_hull_{k:02d}", hull)
-    for i, name in enumerate(part_names):
-        _add_part(spec, i, load_part(name, config.parts_dir))
     return spec
+
+
+def _add_parts(spec: mujoco.MjSpec, config: CellConfig, part_names: Sequence[str]) -> None:
+    parts = {name: load_part(name, config.parts_dir) for name in dict.fromkeys(part_names)}
+    for part in parts.values():
+        add_mesh(spec, f"{part.name}_visual", part.mesh)
+        add_part_material(spec, part.name, part)
+        for k, hull in enumerate(part.hulls):
+            _add_hull(spec, f"{part.name}_hull_{k:02d}", hull)
+    for i, name in enumerate(part_names):
+        _add_part(spec, i, parts[name])
 
 
 def set_visuals(spec: mujoco.MjSpec) -> None:
