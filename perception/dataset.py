@@ -1,0 +1,304 @@
+"""Reads the rendered training data: BOP layout on disk, arrays in memory, one cache file beside the data.
+
+A split is a folder of 1,000-image chunks ``NNNNNN/`` in BOP layout (millimetres, world = board frame) with our key
+``stable_pose`` in ``scene_gt.json``, and a ``manifest.json`` that is written last. In memory everything is in metres.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cad.parts import Part, hash_file
+from cad.spatial import Array, apply, inverse, transform, yaw_of
+from perception.calibration import table_from_board
+from perception.estimates import PerceptionError
+
+MANIFEST = "manifest.json"
+CACHE = "cache.npz"
+MAX_INSTANCES = 255
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Labels:
+    """Resting poses in the table frame seen by the camera, of M parts.
+
+    ``T_cam_part = T_cam_table @ planar(x, y, yaw) @ stable_pose.T_table_part``. ``part_index`` is the place in the
+    sequence of parts, -1 where there is none (then the rest is NaN). ``centre_px`` is the projection of the footprint's
+    centre on the table, ``body_px`` that of the point above it at half the part's height.
+    """
+
+    part_index: NDArray[np.int64]  # (M,)
+    T_cam_table: Array  # (M, 4, 4)
+    x: Array  # (M,)
+    y: Array  # (M,)
+    yaw: Array  # (M,)
+    centre_px: Array  # (M, 2)
+    body_px: Array  # (M, 2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CropSet:
+    """N crops, each with at most one target part; ``obj_id`` is 0 and the pose the identity where there is none."""
+
+    images: NDArray[np.uint8]  # (N, H, W, 3) RGB
+    obj_id: NDArray[np.int64]  # (N,)
+    stable_pose: NDArray[np.int64]  # (N,), -1 where there is no target
+    T_cam_part: Array  # (N, 4, 4)
+    T_cam_board: Array  # (N, 4, 4)
+    K: Array  # (N, 3, 3)
+    packed_masks: NDArray[np.uint8]  # (N, H, ceil(W / 8)), visible pixels of the target
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def masks(self, index: Any = slice(None)) -> NDArray[np.bool_]:
+        """Visible masks (..., H, W) of the chosen crops."""
+        return np.unpackbits(self.packed_masks[index], axis=-1, count=self.images.shape[2]).astype(bool)
+
+    def labels(self, parts: Sequence[Part]) -> Labels:
+        """Resting pose of each crop's target; raises PerceptionError for an obj_id that is none of ``parts``."""
+        return resting_poses(parts, self.obj_id, self.stable_pose, self.T_cam_part, self.T_cam_board, self.K)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WindowSet:
+    """N windows or frames with any number of parts each; M parts in all, in flat arrays.
+
+    ``instance_map`` is 0 on the background and 1 + ``instance`` on the visible pixels of an instance.
+    """
+
+    images: NDArray[np.uint8]  # (N, H, W, 3) RGB
+    instance_map: NDArray[np.uint8]  # (N, H, W)
+    T_cam_board: Array  # (N, 4, 4)
+    K: Array  # (N, 3, 3)
+    image_index: NDArray[np.int64]  # (M,)
+    instance: NDArray[np.int64]  # (M,), position in its image's list
+    obj_id: NDArray[np.int64]  # (M,)
+    stable_pose: NDArray[np.int64]  # (M,)
+    T_cam_part: Array  # (M, 4, 4)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def labels(self, parts: Sequence[Part]) -> Labels:
+        """Resting pose of each instance; raises PerceptionError for an obj_id that is none of ``parts``."""
+        i = self.image_index
+        return resting_poses(parts, self.obj_id, self.stable_pose, self.T_cam_part, self.T_cam_board[i], self.K[i])
+
+    @cached_property
+    def instances_of(self) -> list[NDArray[np.int64]]:
+        """For each image the rows of the flat arrays that belong to it."""
+        order = np.argsort(self.image_index, kind="stable")
+        return np.split(order, np.searchsorted(self.image_index[order], np.arange(1, len(self))))
+
+
+def resting_poses(
+    parts: Sequence[Part],
+    obj_id: NDArray[np.int64],
+    stable_pose: NDArray[np.int64],
+    T_cam_part: Array,
+    T_cam_board: Array,
+    K: Array,
+) -> Labels:
+    """Planar coordinates and projected centres of M parts from their poses; ``obj_id`` 0 stands for no part."""
+    index_of = {part.obj_id: i for i, part in enumerate(parts)} | {0: -1}
+    unknown = sorted(set(obj_id.tolist()) - set(index_of))
+    if unknown:
+        known = ", ".join(f"{part.obj_id} ({part.name})" for part in parts)
+        raise PerceptionError(f"the data holds obj_id {unknown}, which is none of the parts {known}")
+    part_index = np.array([index_of[i] for i in obj_id.tolist()], np.int64)
+    T_cam_table = np.stack([table_from_board(T) for T in T_cam_board]) if len(obj_id) else np.zeros((0, 4, 4))
+    planar = np.full((len(obj_id), 3), np.nan)
+    centres = np.full((2, len(obj_id), 2), np.nan)
+    half_heights: dict[tuple[int, int], float] = {}
+    for m in np.nonzero(part_index >= 0)[0]:
+        part, k = parts[part_index[m]], int(stable_pose[m])
+        if not 0 <= k < len(part.stable_poses):
+            raise PerceptionError(
+                f"the data holds stable pose {k} of {part.name}, which has {len(part.stable_poses)}: render it again"
+            )
+        pose = part.stable_poses[k]
+        if (part_index[m], k) not in half_heights:
+            half_heights[part_index[m], k] = apply(pose.T_table_part, part.mesh.vertices)[:, 2].max() / 2
+        T = inverse(T_cam_table[m]) @ T_cam_part[m] @ inverse(pose.T_table_part)
+        planar[m] = T[0, 3], T[1, 3], yaw_of(T[:3, :3])
+        for row, z in enumerate((0.0, half_heights[part_index[m], k])):
+            u, v, w = K[m] @ apply(T_cam_table[m], [planar[m, 0], planar[m, 1], z])
+            centres[row, m] = u / w, v / w
+    return Labels(
+        part_index=part_index,
+        T_cam_table=T_cam_table,
+        x=planar[:, 0],
+        y=planar[:, 1],
+        yaw=planar[:, 2],
+        centre_px=centres[0],
+        body_px=centres[1],
+    )
+
+
+def manifest_hash(split_dir: Path) -> str:
+    """Hash of a split's manifest, which names the split in caches and weight files."""
+    path = split_dir / MANIFEST
+    if not path.exists():
+        raise PerceptionError(f"no {MANIFEST} in {split_dir}: it is no rendered split, or its rendering did not finish")
+    return hash_file(path)
+
+
+def load_crops(split_dir: Path) -> CropSet:
+    """All crops of a split, from the cache beside it when that is of the same manifest."""
+    return _cached(split_dir, CropSet, _read_crops)
+
+
+def load_windows(split_dir: Path) -> WindowSet:
+    """All windows or frames of a split, from the cache beside it when that is of the same manifest."""
+    return _cached(split_dir, WindowSet, _read_windows)
+
+
+Kind = TypeVar("Kind", CropSet, WindowSet)
+
+
+def _cached(split_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> Kind:
+    key, path = f"{kind.__name__} {manifest_hash(split_dir)}", split_dir / CACHE
+    if path.exists():
+        with np.load(path, allow_pickle=False) as stored:
+            if str(stored["key"]) == key:
+                return kind(**{f.name: stored[f.name] for f in fields(kind)})
+    loaded = read(split_dir)
+    aside = path.with_suffix(".part.npz")
+    np.savez(aside, key=np.array(key), **{f.name: getattr(loaded, f.name) for f in fields(kind)})
+    os.replace(aside, path)
+    return loaded
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One image of a chunk and what its JSON files say about it."""
+
+    chunk: Path
+    image_id: int
+    camera: dict[str, Any]
+    instances: list[dict[str, Any]]
+
+    def image(self) -> NDArray[np.uint8]:
+        for suffix in (".png", ".jpg"):
+            path = self.chunk / "rgb" / f"{self.image_id:06d}{suffix}"
+            if path.exists():
+                return _read_image(path, cv2.IMREAD_COLOR)[..., ::-1]
+        raise PerceptionError(f"no image {self.image_id:06d}.png or .jpg in {self.chunk / 'rgb'}")
+
+    def mask(self, instance: int) -> NDArray[np.bool_]:
+        name = f"{self.image_id:06d}_{instance:06d}.png"
+        return _read_image(self.chunk / "mask_visib" / name, cv2.IMREAD_GRAYSCALE) > 0
+
+
+def _entries(split_dir: Path) -> list[_Entry]:
+    chunks = sorted(p for p in split_dir.iterdir() if p.is_dir() and re.fullmatch(r"\d{6}", p.name))
+    if not chunks:
+        raise PerceptionError(f"{split_dir} holds no chunk folder like 000000")
+    out = []
+    for chunk in chunks:
+        cameras, truth = (_read_json(chunk / name) for name in ("scene_camera.json", "scene_gt.json"))
+        if set(cameras) != set(truth):
+            raise PerceptionError(f"{chunk}: scene_camera.json has {len(cameras)} images, scene_gt.json {len(truth)}")
+        out += [_Entry(chunk, i, cameras[str(i)], truth[str(i)]) for i in sorted(map(int, cameras))]
+    return out
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise PerceptionError(f"{path} cannot be read: {error}") from error
+
+
+def _read_image(path: Path, flags: int) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise PerceptionError(f"{path} is missing or is no image")
+    return np.asarray(image, np.uint8)
+
+
+def _pose_m(entry: dict[str, Any], rotation: str, translation: str) -> Array:
+    return transform(np.reshape(entry[rotation], (3, 3)), np.asarray(entry[translation], np.float64) / 1e3)
+
+
+def _read_images(entries: Sequence[_Entry]) -> NDArray[np.uint8]:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        images = pool.map(_Entry.image, entries)
+        first = next(images)
+        out = np.empty((len(entries), *first.shape), np.uint8)
+        out[0] = first
+        for i, image in enumerate(images, start=1):
+            if image.shape != first.shape:
+                raise PerceptionError(
+                    f"image {entries[i].image_id} of {entries[i].chunk} is {image.shape[1]} x {image.shape[0]}, the "
+                    f"first one {first.shape[1]} x {first.shape[0]}: all of a split must be of one size"
+                )
+            out[i] = image
+    return out
+
+
+def _cameras(entries: Sequence[_Entry]) -> tuple[Array, Array]:
+    K = np.stack([np.reshape(e.camera["cam_K"], (3, 3)).astype(np.float64) for e in entries])
+    return np.stack([_pose_m(e.camera, "cam_R_w2c", "cam_t_w2c") for e in entries]), K
+
+
+def _read_crops(split_dir: Path) -> CropSet:
+    entries = _entries(split_dir)
+    images = _read_images(entries)
+    T_cam_board, K = _cameras(entries)
+    targets = [e.instances[0] if e.instances else None for e in entries]
+    empty = np.zeros(images.shape[1:3], bool)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        masks = pool.map(lambda e: np.packbits(e.mask(0) if e.instances else empty, axis=-1), entries)
+        packed = np.stack(list(masks))
+    return CropSet(
+        images=images,
+        obj_id=np.array([t["obj_id"] if t else 0 for t in targets], np.int64),
+        stable_pose=np.array([t["stable_pose"] if t else -1 for t in targets], np.int64),
+        T_cam_part=np.stack([_pose_m(t, "cam_R_m2c", "cam_t_m2c") if t else np.eye(4) for t in targets]),
+        T_cam_board=T_cam_board,
+        K=K,
+        packed_masks=packed,
+    )
+
+
+def _instance_map(entry: _Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    if len(entry.instances) > MAX_INSTANCES:
+        raise PerceptionError(f"image {entry.image_id} of {entry.chunk} has more than {MAX_INSTANCES} instances")
+    out = np.zeros(shape, np.uint8)
+    for k in range(len(entry.instances)):
+        out[entry.mask(k)] = k + 1
+    return out
+
+
+def _read_windows(split_dir: Path) -> WindowSet:
+    entries = _entries(split_dir)
+    images = _read_images(entries)
+    T_cam_board, K = _cameras(entries)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        maps = np.stack(list(pool.map(lambda e: _instance_map(e, images.shape[1:3]), entries)))
+    flat = [(i, k, instance) for i, e in enumerate(entries) for k, instance in enumerate(e.instances)]
+    return WindowSet(
+        images=images,
+        instance_map=maps,
+        T_cam_board=T_cam_board,
+        K=K,
+        image_index=np.array([i for i, _, _ in flat], np.int64),
+        instance=np.array([k for _, k, _ in flat], np.int64),
+        obj_id=np.array([g["obj_id"] for _, _, g in flat], np.int64),
+        stable_pose=np.array([g["stable_pose"] for _, _, g in flat], np.int64),
+        T_cam_part=np.array([_pose_m(g, "cam_R_m2c", "cam_t_m2c") for _, _, g in flat]).reshape(-1, 4, 4),
+    )

@@ -1,0 +1,269 @@
+"""Finds the parts in a whole frame: instance masks, centres and classes at a quarter of the camera's resolution.
+
+An encoder-decoder with three outputs, after Panoptic-DeepLab (Cheng et al. 2020) and CenterNet (Zhou et al. 2019): a
+foreground mask, for each foreground pixel the offset to its instance's centre, and a heatmap of centres with class
+logits. Foreground pixels whose vote falls near a peak of the heatmap form an instance. The input is normalised by its
+local mean and contrast, so that exposure and shading matter little.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from cad.spatial import Array
+from perception.estimates import Frame, PerceptionError
+from perception.training import default_device, load_weights
+
+REDUCTION = 4
+"""Frame pixels along each side of a pixel that the network sees."""
+HEAT_STRIDE = 4
+OFFSET_STRIDE = 2
+NETWORK_STRIDE = 16
+"""Input sizes must be whole multiples of this; frames are padded."""
+OFFSET_SCALE_PX = 8.0
+NORMALISATION_WINDOW_PX = 97
+"""Side of the square, about 26 mm, over which brightness and contrast are normalised."""
+CONTRAST_FLOOR = 8.0
+"""Added to the local standard deviation in grey levels, so that noise on flat areas is not blown up."""
+WEIGHTS = "segmentation.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection:
+    """One part found in a frame.
+
+    ``centre_px`` (2,) is in pixels of the frame, the point above the footprint's centre at half the part's height.
+    ``class_probabilities`` (P,) is in the order of the segmenter's ``part_names``. ``mask`` (h, w) bool covers the
+    pixels of the frame reduced by 4 from ``mask_origin`` (u, v) on.
+    """
+
+    centre_px: Array
+    score: float
+    class_probabilities: Array
+    mask: NDArray[np.bool_]
+    mask_origin: tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecodeConfig:
+    """Thresholds that turn the network's outputs into instances; lengths in reduced pixels."""
+
+    peak: float = 0.3
+    mask: float = 0.5
+    score: float = 0.3
+    vote_radius_px: float = 12.0
+    min_area_px: int = 30
+    max_peaks: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ("peak", "mask", "score"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be between 0 and 1")
+
+
+def normalise(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """An RGB image (H, W, 3) minus its local mean brightness, over its local contrast."""
+    rgb = image.astype(np.float32)
+    gray = rgb.mean(axis=2)
+    side = (NORMALISATION_WINDOW_PX, NORMALISATION_WINDOW_PX)
+    mean = cv2.blur(gray, side, borderType=cv2.BORDER_REFLECT_101)
+    variance = cv2.blur(gray * gray, side, borderType=cv2.BORDER_REFLECT_101) - mean * mean
+    scale = 1.0 / (np.sqrt(np.maximum(variance, 0.0)) + CONTRAST_FLOOR)
+    return (rgb - mean[..., None]) * scale[..., None]
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(self.first(x)))
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What the network says about a batch of (H, W) images, as float32 logits and pixels."""
+
+    mask: Tensor  # (B, H, W)
+    offset_px: Tensor  # (B, 2, H / 2, W / 2), reduced pixels
+    heat: Tensor  # (B, H / 4, W / 4)
+    classes: Tensor  # (B, P, H / 4, W / 4)
+
+
+class SegmentationNet(nn.Module):
+    """Encoder to stride 16, decoder back to stride 2 with a skip at each stage, 0.5 M parameters."""
+
+    def __init__(self, n_parts: int, widths: Sequence[int] = (16, 32, 48, 96)) -> None:
+        super().__init__()
+        a, b, c, d = widths
+        self.stage2 = _convolution(3, a, stride=2, kernel=5)
+        self.stage4 = nn.Sequential(_convolution(a, b, stride=2), _convolution(b, b))
+        self.stage8 = nn.Sequential(_convolution(b, c, stride=2), _Residual(c))
+        self.stage16 = nn.Sequential(_convolution(c, d, stride=2), _Residual(d), _Residual(d))
+        self.to8 = _convolution(d, c, kernel=1)
+        self.at8 = _convolution(c, c)
+        self.to4 = _convolution(c, b, kernel=1)
+        self.at4 = _convolution(b, b)
+        self.to2 = _convolution(b, a, kernel=1)
+        self.at2 = _convolution(a, 24)
+        self.pixel_head = nn.Conv2d(24, 4 + 2, 1)
+        self.centre_head = nn.Sequential(_convolution(b, b), nn.Conv2d(b, 1 + n_parts, 1))
+        final = self.centre_head[1]
+        assert isinstance(final, nn.Conv2d) and final.bias is not None
+        nn.init.constant_(final.bias[:1], -3.0)
+
+    def forward(self, images: Tensor) -> Outputs:
+        """Outputs for normalised images (B, 3, H, W), H and W whole multiples of 16."""
+        x2 = self.stage2(images)
+        x4 = self.stage4(x2)
+        x8 = self.stage8(x4)
+        x16 = self.stage16(x8)
+        y8 = self.at8(_double(self.to8(x16)) + x8)
+        y4 = self.at4(_double(self.to4(y8)) + x4)
+        y2 = self.at2(_double(self.to2(y4)) + x2)
+        pixels, centres = self.pixel_head(y2).float(), self.centre_head(y4).float()
+        return Outputs(
+            mask=functional.pixel_shuffle(pixels[:, :4], 2)[:, 0],
+            offset_px=pixels[:, 4:] * OFFSET_SCALE_PX,
+            heat=centres[:, 0],
+            classes=centres[:, 1:],
+        )
+
+
+def _double(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def reduced_autocast(device: torch.device) -> contextlib.AbstractContextManager[Any]:
+    """bfloat16 where the device computes it natively."""
+    return torch.autocast(device.type, torch.bfloat16)
+
+
+def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = REDUCTION) -> list[Detection]:
+    """Instances of image ``index`` of a batch, best first."""
+    heat = outputs.heat[index].sigmoid()
+    # Peaks are local maxima over 5 x 5 heat cells, 5 mm: parts at rest beside each other have centres further apart.
+    maxima = functional.max_pool2d(heat[None, None], 5, 1, 2)[0, 0] == heat
+    rows, columns = (axis.cpu().numpy() for axis in torch.nonzero(maxima & (heat > config.peak), as_tuple=True))
+    heat = heat.cpu().numpy()
+    order = np.argsort(-heat[rows, columns], kind="stable")[: config.max_peaks]
+    rows, columns = rows[order], columns[order]
+    mask = outputs.mask[index].sigmoid().cpu().numpy()
+    v, u = np.nonzero(mask > config.mask)
+    if not len(rows) or not len(v):
+        return []
+    offset = outputs.offset_px[index].cpu().numpy()
+    cell_v, cell_u = v // OFFSET_STRIDE, u // OFFSET_STRIDE
+    half = (OFFSET_STRIDE - 1) / 2
+    votes = offset[:, cell_v, cell_u].T + np.stack([cell_u, cell_v], axis=1) * OFFSET_STRIDE + half  # (F, 2)
+    peaks = np.stack([columns, rows], axis=1) * HEAT_STRIDE + (HEAT_STRIDE - 1) / 2  # (Q, 2)
+    squared = ((votes[:, None] - peaks[None]) ** 2).sum(axis=-1)  # (F, Q)
+    owner = np.where(squared.min(axis=1) < config.vote_radius_px**2, squared.argmin(axis=1), -1)
+    probabilities = outputs.classes[index].softmax(dim=0).cpu().numpy()
+    found = []
+    for q in range(len(peaks)):
+        mine = owner == q
+        if np.count_nonzero(mine) < config.min_area_px:
+            continue
+        blob, origin = _largest_blob(u[mine], v[mine])
+        if np.count_nonzero(blob) < config.min_area_px:
+            continue
+        inside = blob[v[mine] - origin[1], u[mine] - origin[0]]
+        ui, vi = u[mine][inside], v[mine][inside]
+        score = float(heat[rows[q], columns[q]] * mask[vi, ui].mean())
+        if score < config.score:
+            continue
+        classes = probabilities[:, vi // HEAT_STRIDE, ui // HEAT_STRIDE].mean(axis=1)
+        centre = np.median(votes[mine][inside], axis=0).astype(np.float64)
+        found.append(
+            Detection(
+                centre_px=(centre + 0.5) * reduction - 0.5,
+                score=score,
+                class_probabilities=classes.astype(np.float64),
+                mask=blob,
+                mask_origin=origin,
+            )
+        )
+    return sorted(found, key=lambda detection: -detection.score)
+
+
+def _largest_blob(u: NDArray[np.int64], v: NDArray[np.int64]) -> tuple[NDArray[np.bool_], tuple[int, int]]:
+    """The largest connected piece of the pixels (u, v), cut to its bounds, and its first pixel."""
+    image = np.zeros((v.max() - v.min() + 1, u.max() - u.min() + 1), np.uint8)
+    image[v - v.min(), u - u.min()] = 1
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(image)
+    best = 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
+    left, top, width, height = (int(x) for x in statistics[best, : cv2.CC_STAT_AREA])
+    blob = np.asarray(labels)[top : top + height, left : left + width] == best
+    return blob, (int(u.min()) + left, int(v.min()) + top)
+
+
+class Segmenter:
+    """A trained network with its thresholds."""
+
+    def __init__(self, net: SegmentationNet, part_names: Sequence[str], config: DecodeConfig) -> None:
+        self.device = default_device()
+        self.net = net.to(self.device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
+        self.part_names = tuple(part_names)
+        self.config = config
+
+    @classmethod
+    def load(cls, weights_dir: Path, parts_dir: Path | None = None) -> Segmenter:
+        """The segmenter kept in ``weights_dir``; raises PerceptionError when there is none or a mesh has changed."""
+        path = weights_dir / WEIGHTS
+        state, metadata = load_weights(path, parts_dir)
+        names = list(metadata["parts"])
+        net = SegmentationNet(len(names))
+        try:
+            net.load_state_dict(state)
+        except RuntimeError as error:
+            raise PerceptionError(f"{path} holds another network than this version's; train again") from error
+        return cls(net, names, DecodeConfig(**metadata.get("decode", {})))
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """The parts in a frame, best first, those cut by the image's border included."""
+        height, width = (size // REDUCTION for size in frame.image.shape[:2])
+        if min(height, width) < NETWORK_STRIDE:
+            raise PerceptionError(
+                f"a frame of {frame.image.shape[1]} x {frame.image.shape[0]} pixels is too small; at least "
+                f"{REDUCTION * NETWORK_STRIDE} on each side are needed"
+            )
+        image = frame.image[: height * REDUCTION, : width * REDUCTION]
+        return self.detect_reduced(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8))
+
+    def detect_reduced(self, image: NDArray[np.uint8]) -> list[Detection]:
+        """The parts in an RGB image (H, W, 3) that is already reduced; centres are still in frame pixels."""
+        height, width = image.shape[:2]
+        bottom, right = -height % NETWORK_STRIDE, -width % NETWORK_STRIDE
+        padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REFLECT_101)
+        x = torch.from_numpy(normalise(np.asarray(padded, np.uint8))).permute(2, 0, 1)[None].to(self.device)
+        with torch.inference_mode(), reduced_autocast(self.device):
+            outputs = self.net(x.contiguous(memory_format=torch.channels_last))
+        seen = Outputs(
+            mask=outputs.mask[:, :height, :width],
+            offset_px=outputs.offset_px,
+            heat=outputs.heat,
+            classes=outputs.classes,
+        )
+        return decode(seen, 0, self.config)

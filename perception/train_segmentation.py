@@ -1,0 +1,228 @@
+"""Trains the whole-frame segmenter on rendered windows and measures it on windows it has not seen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from cad.parts import load_part, part_names
+from perception.dataset import load_windows, manifest_hash
+from perception.metrics import DetectionScores, mask_iou, summary
+from perception.segmentation import (
+    HEAT_STRIDE,
+    OFFSET_STRIDE,
+    REDUCTION,
+    WEIGHTS,
+    DecodeConfig,
+    Outputs,
+    SegmentationNet,
+    Segmenter,
+    normalise,
+    reduced_autocast,
+)
+from perception.training import (
+    Losses,
+    TrainingConfig,
+    default_device,
+    load_weights,
+    save_weights,
+    seeded,
+    train,
+    weights_metadata,
+)
+from perception.windows import MIN_VISIBLE_PX, Window, Windows, flip, paste, recolour, warp
+
+NO_CLASS = -100
+HEAT_SIGMA_CELLS = 1.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationTraining(TrainingConfig):
+    """Where the windows are and how they are varied; the rest as in ``TrainingConfig``.
+
+    ``start`` names a folder with earlier weights to go on from. ``warp`` is the share of windows that are turned and
+    scaled, ``paste`` the share that get a part of another window in a free place.
+    """
+
+    data: Path
+    val: Path
+    out: Path = Path("perception/weights")
+    start: Path | None = None
+    minutes: float = 16.0
+    batch: int = 8
+    learning_rate: float = 3e-3
+    warp: float = 0.4
+    paste: float = 0.3
+    validate_windows: int = 120
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What ``Outputs`` should be."""
+
+    mask: Tensor  # (B, H, W)
+    offset_px: Tensor  # (B, 2, H / 2, W / 2)
+    foreground: Tensor  # (B, H / 2, W / 2), where offsets count
+    heat: Tensor  # (B, H / 4, W / 4)
+    classes: Tensor  # (B, H / 4, W / 4), NO_CLASS where there is none
+
+
+def targets_of(window: Window) -> dict[str, NDArray]:
+    """Arrays of one example under the names of ``Targets``. A centre outside the window counts at its border."""
+    height, width = window.instances.shape
+    area = np.bincount(window.instances.ravel(), minlength=len(window.centres) + 1)
+    centres = np.clip(window.centres, 2.0, [width - 3.0, height - 3.0]).reshape(-1, 2)
+    offset = np.zeros((2, height // OFFSET_STRIDE, width // OFFSET_STRIDE), np.float32)
+    # (H, W) -> blocks (H / 2, 2, W / 2, 2): a block that holds any foreground has an owner
+    owner = window.instances.reshape(offset.shape[1], OFFSET_STRIDE, offset.shape[2], OFFSET_STRIDE).max(axis=(1, 3))
+    v, u = np.nonzero(owner)
+    half = (OFFSET_STRIDE - 1) / 2
+    offset[:, v, u] = (centres[owner[v, u] - 1] - np.stack([u, v], axis=1) * OFFSET_STRIDE - half).T
+    at = HEAT_STRIDE // 2 - 1
+    class_of = np.concatenate([[NO_CLASS], window.classes])
+    classes = class_of[window.instances[at::HEAT_STRIDE, at::HEAT_STRIDE]]
+    heat = np.zeros((height // HEAT_STRIDE, width // HEAT_STRIDE), np.float32)
+    columns, rows = np.arange(heat.shape[1]), np.arange(heat.shape[0])
+    for k, (cu, cv) in enumerate(centres):
+        if area[k + 1] < MIN_VISIBLE_PX:
+            continue
+        i, j = (round((c - (HEAT_STRIDE - 1) / 2) / HEAT_STRIDE) for c in (cu, cv))
+        i, j = min(max(i, 0), heat.shape[1] - 1), min(max(j, 0), heat.shape[0] - 1)
+        squared = (columns[None] - i) ** 2 + (rows[:, None] - j) ** 2
+        heat = np.maximum(heat, np.exp(-squared / (2 * HEAT_SIGMA_CELLS**2)).astype(np.float32))
+        classes[j, i] = window.classes[k]
+    return {
+        "mask": (window.instances > 0).astype(np.float32),
+        "offset_px": offset,
+        "foreground": (owner > 0).astype(np.float32),
+        "heat": heat,
+        "classes": classes,
+    }
+
+
+def example(windows: Windows, rng: np.random.Generator, config: SegmentationTraining) -> Window:
+    """A randomly chosen and varied window."""
+    window = windows[int(rng.integers(len(windows)))]
+    if rng.random() < config.paste:
+        window = paste(window, flip(windows[int(rng.integers(len(windows)))], rng), rng)
+    window = flip(window, rng)
+    if rng.random() < config.warp:
+        window = warp(window, rng)
+    return Window(recolour(window.image, rng), window.instances, window.centres, window.classes)
+
+
+def batch_of(examples: Sequence[Window], device: torch.device) -> tuple[Tensor, Targets]:
+    """Normalised images (B, 3, H, W) and their targets."""
+    images = torch.from_numpy(np.stack([normalise(e.image) for e in examples])).permute(0, 3, 1, 2)
+    arrays = [targets_of(e) for e in examples]
+    targets = Targets(**{key: torch.from_numpy(np.stack([a[key] for a in arrays])).to(device) for key in arrays[0]})
+    return images.to(device).contiguous(memory_format=torch.channels_last), targets
+
+
+def losses(outputs: Outputs, targets: Targets) -> Losses:
+    """Weighted loss terms: mask BCE and Dice, offsets on the foreground, penalty-reduced focal heat, classes."""
+    mask = targets.mask
+    cross_entropy = functional.binary_cross_entropy_with_logits(outputs.mask, mask, reduction="none")
+    probability = outputs.mask.sigmoid()
+    overlap = (probability * mask).sum((1, 2))
+    dice = 1 - (2 * overlap + 20) / (probability.sum((1, 2)) + mask.sum((1, 2)) + 20)
+    distance = functional.smooth_l1_loss(outputs.offset_px, targets.offset_px, reduction="none").sum(1)
+    return {
+        "mask": 3.0 * (cross_entropy * (1 + 2 * mask)).mean(),
+        "dice": dice.mean(),
+        "offset": 0.15 * (distance * targets.foreground).sum() / (targets.foreground.sum() + 50),
+        "heat": focal(outputs.heat, targets.heat),
+        "class": 0.3 * functional.cross_entropy(outputs.classes, targets.classes, ignore_index=NO_CLASS)
+        if bool((targets.classes != NO_CLASS).any())
+        else 0.0 * outputs.classes.sum(),
+    }
+
+
+def focal(logits: Tensor, heat: Tensor) -> Tensor:
+    """CenterNet's penalty-reduced focal loss (Zhou et al. 2019, eq. 1), per centre."""
+    p = logits.sigmoid().clamp(1e-4, 1 - 1e-4)
+    centre = (heat > 0.999).float()
+    terms = centre * (1 - p) ** 2 * p.log() + (1 - centre) * (1 - heat) ** 4 * p**2 * (1 - p).log()
+    return -terms.sum() / (centre.sum() + 1)
+
+
+def evaluate(segmenter: Segmenter, windows: Windows, chosen: Sequence[int] | None = None) -> dict[str, float]:
+    """Figures of ``DetectionScores`` and class accuracy, centre error (frame pixels) and ms an image, on windows."""
+    scores, centre_px, right, seconds = DetectionScores(), [], [], []
+    for index in range(len(windows)) if chosen is None else chosen:
+        window = windows[index]
+        start = time.perf_counter()
+        found = segmenter.detect_reduced(window.image)
+        seconds.append(time.perf_counter() - start)
+        truth = [window.instances == k + 1 for k in range(len(window.centres))]
+        iou = np.array([[mask_iou(d.mask, t, d.mask_origin) for t in truth] for d in found])
+        iou = iou.reshape(len(found), len(truth))
+        scores.add(iou, [d.score for d in found], [np.count_nonzero(t) < MIN_VISIBLE_PX for t in truth])
+        for d, detection in enumerate(found):
+            if len(truth) and iou[d].max() >= 0.5:
+                k = int(iou[d].argmax())
+                error = detection.centre_px - ((window.centres[k] + 0.5) * REDUCTION - 0.5)
+                inside = np.all((window.centres[k] > 2) & (window.centres[k] < np.array(truth[k].shape[::-1]) - 3))
+                centre_px += [float(np.linalg.norm(error))] if inside else []
+                right.append(int(detection.class_probabilities.argmax()) == window.classes[k])
+    centre = summary(centre_px)
+    return scores.report() | {
+        "class_accuracy": float(np.mean(right)) if right else float("nan"),
+        "centre_median_px": centre["median"],
+        "centre_p95_px": centre["p95"],
+        "image_ms": 1e3 * float(np.median(seconds)),
+    }
+
+
+def train_segmentation(config: SegmentationTraining) -> None:
+    """Train, pick the decoding thresholds on the validation windows, and keep the weights with their figures."""
+    cv2.setNumThreads(config.threads)
+    names = part_names()
+    parts = [load_part(name) for name in names]
+    training, validation = (Windows(load_windows(path), parts) for path in (config.data, config.val))
+    device = default_device()
+    with seeded(config.seed):
+        net = SegmentationNet(len(parts)).to(device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    if config.start is not None:
+        net.load_state_dict(load_weights(config.start / WEIGHTS)[0])
+
+    def step(rng: np.random.Generator) -> Losses:
+        images, targets = batch_of([example(training, rng, config) for _ in range(config.batch)], device)
+        with reduced_autocast(device):
+            outputs = net(images)
+        return losses(outputs, targets)
+
+    def validate(model: nn.Module) -> dict[str, float]:
+        assert isinstance(model, SegmentationNet)
+        few = range(min(config.validate_windows, len(validation)))
+        figures = evaluate(Segmenter(model, names, DecodeConfig()), validation, few)
+        return {key: figures[key] for key in ("ap50", "precision50", "recall50", "centre_median_px")}
+
+    result = train("segmentation", net, step, config, config.out, validate=validate)
+    net.load_state_dict(result.state_dict)
+    decode, figures = best_thresholds(net, names, validation)
+    data = {str(path): manifest_hash(path) for path in (config.data, config.val)}
+    metadata = weights_metadata(names, config, result, data, figures) | {"decode": asdict(decode)}
+    save_weights(config.out / WEIGHTS, result.state_dict, metadata)
+    print("  ".join(f"{key} {value:.4f}" for key, value in figures.items()))
+
+
+def best_thresholds(
+    net: SegmentationNet, names: Sequence[str], validation: Windows
+) -> tuple[DecodeConfig, dict[str, float]]:
+    """The thresholds with the highest sum of precision and recall at overlap 0.5, and the figures there."""
+    tried = []
+    for peak in (0.2, 0.3, 0.4):
+        for score in (0.15, 0.25, 0.35, 0.45):
+            config = DecodeConfig(peak=peak, score=score)
+            tried.append((config, evaluate(Segmenter(net, names, config), validation)))
+    return max(tried, key=lambda pair: pair[1]["precision50"] + pair[1]["recall50"])

@@ -1,0 +1,127 @@
+"""Training windows of the segmenter and how they are varied: symmetries, warps, pasted parts, light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cad.parts import Part
+from cad.spatial import Array
+from perception.dataset import WindowSet
+
+MIN_VISIBLE_PX = 40
+"""Slivers of fewer visible pixels (3 mm^2) at a window's border get no centre and do not count in the figures."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """One training example: image (H, W, 3), instance map (H, W), and centre (u, v) and class of each instance."""
+
+    image: NDArray[np.uint8]
+    instances: NDArray[np.uint8]
+    centres: Array  # (I, 2), pixels of the window
+    classes: NDArray[np.int64]  # (I,)
+
+
+class Windows:
+    """The training windows as examples."""
+
+    def __init__(self, data: WindowSet, parts: Sequence[Part]) -> None:
+        self.data = data
+        self.labels = data.labels(parts)
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> Window:
+        rows = self.data.instances_of[index]
+        order = rows[np.argsort(self.data.instance[rows])]
+        return Window(
+            image=self.data.images[index],
+            instances=self.data.instance_map[index],
+            centres=self.labels.body_px[order],
+            classes=self.labels.part_index[order],
+        )
+
+
+def flip(window: Window, rng: np.random.Generator) -> Window:
+    """One of the eight exact symmetries of the square grid."""
+    image, instances, centres = window.image, window.instances, window.centres.copy()
+    if rng.random() < 0.5:
+        image, instances, centres = image.transpose(1, 0, 2), instances.T, centres[:, ::-1].copy()
+    for axis in (0, 1):
+        if rng.random() < 0.5:
+            image, instances = np.flip(image, axis), np.flip(instances, axis)
+            centres[:, 1 - axis] = instances.shape[axis] - 1 - centres[:, 1 - axis]
+    return Window(np.ascontiguousarray(image), np.ascontiguousarray(instances), centres, window.classes)
+
+
+def warp(window: Window, rng: np.random.Generator) -> Window:
+    """Turned by any angle, scaled by up to 15 % and shifted; what comes in from outside is one grey."""
+    height, width = window.instances.shape
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    A = cv2.getRotationMatrix2D(middle, rng.uniform(0, 360), np.exp(rng.uniform(-0.15, 0.15)))
+    A[:, 2] += rng.uniform(-40, 40, 2)
+    size, grey = (width, height), tuple(int(x) for x in rng.integers(40, 220, 3))
+    image = cv2.warpAffine(window.image, A, size, flags=cv2.INTER_LINEAR, borderValue=grey)
+    instances = cv2.warpAffine(window.instances, A, size, flags=cv2.INTER_NEAREST, borderValue=(0,))
+    return Window(
+        np.asarray(image, np.uint8),
+        np.asarray(instances, np.uint8),
+        window.centres @ A[:, :2].T + A[:, 2],
+        window.classes,
+    )
+
+
+def paste(window: Window, other: Window, rng: np.random.Generator, margin: int = 6) -> Window:
+    """A part of ``other`` with its shadow's rim copied to a place without parts; the window itself if none is free."""
+    area = np.bincount(other.instances.ravel(), minlength=len(other.centres) + 1)
+    choices = np.nonzero(area[1:] >= 4 * MIN_VISIBLE_PX)[0]
+    if not len(choices):
+        return window
+    k = int(rng.choice(choices))
+    v, u = np.nonzero(other.instances == k + 1)
+    height, width = window.instances.shape
+    if min(u.min(), v.min()) < margin or u.max() >= width - margin or v.max() >= height - margin:
+        return window
+    box = np.s_[v.min() - margin : v.max() + margin + 1, u.min() - margin : u.max() + margin + 1]
+    patch, own = other.image[box], other.instances[box] == k + 1
+    j = int(rng.integers(0, height - own.shape[0] + 1))
+    i = int(rng.integers(0, width - own.shape[1] + 1))
+    place = np.s_[j : j + own.shape[0], i : i + own.shape[1]]
+    if window.instances[place].any():
+        return window
+    image, instances = window.image.copy(), window.instances.copy()
+    alpha = cv2.GaussianBlur(own.astype(np.float32), (0, 0), 0.6)[..., None]
+    if rng.random() < 0.5:
+        alpha = np.maximum(alpha, 0.5 * cv2.GaussianBlur(own.astype(np.float32), (0, 0), 3.0)[..., None])
+    image[place] = (alpha * patch + (1 - alpha) * image[place]).astype(np.uint8)
+    instances[place][own] = len(window.centres) + 1
+    shift = np.array([i - box[1].start, j - box[0].start])
+    return Window(
+        image,
+        instances,
+        np.concatenate([window.centres, other.centres[k : k + 1] + shift]),
+        np.append(window.classes, other.classes[k]),
+    )
+
+
+def recolour(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Another exposure, white balance, contrast, sharpness and noise."""
+    x = image.astype(np.float32)
+    if rng.random() < 0.25:
+        x = np.repeat(x.mean(axis=2, keepdims=True), 3, axis=2)
+    x = 255.0 * np.power(x / 255.0, np.exp(rng.normal(0.0, 0.2))) * np.exp(rng.normal(0.0, 0.2))
+    x *= np.exp(rng.normal(0.0, 0.06, 3)).astype(np.float32)
+    if rng.random() < 0.3:
+        ramp = np.linspace(-1.0, 1.0, x.shape[1], dtype=np.float32)
+        x *= np.exp(rng.normal(0, 0.2) * ramp[:, None] + rng.normal(0, 0.2) * ramp[: x.shape[0], None, None])
+    if rng.random() < 0.3:
+        blurred = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.0))
+        x = blurred if rng.random() < 0.6 else 2.0 * x - blurred
+    x += rng.normal(0.0, rng.uniform(0.0, 5.0)) + rng.standard_normal(x.shape, np.float32) * rng.uniform(0.0, 5.0)
+    return np.clip(x, 0, 255).astype(np.uint8)

@@ -1,0 +1,173 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from cad.parts import Part, StablePose, planar
+from cad.spatial import BASLER, Array, Intrinsics, inverse, rotation_from_rotvec, rotation_x, rotation_y, transform
+from perception.calibration import table_from_board
+from perception.dataset import load_crops, load_windows
+from perception.estimates import PerceptionError
+
+SIZE = 64
+WINDOW = BASLER.crop(2700, 1700, 2 * SIZE, 2 * SIZE).downscaled(2)
+T_CAM_BOARD = inverse(
+    transform(rotation_x(np.pi), [0.0, 0.0, 0.7]) @ transform(rotation_from_rotvec([0.01, 0.005, 0.3]))
+)
+X, Y, YAW = 0.0004, -0.0003, 0.8
+
+
+def part(obj_id: int) -> Part:
+    """A 4 x 6 x 2 mm block with two faces to rest on."""
+    rotations = [np.eye(3), rotation_y(np.pi / 2)]
+    heights = [1e-3, 2e-3]
+    return Part(
+        name=f"block{obj_id}",
+        obj_id=obj_id,
+        folder=Path(),
+        mass_kg=1e-3,
+        material="steel",
+        rgba=(0.5, 0.5, 0.5, 1.0),
+        metallic=1.0,
+        roughness=0.5,
+        mesh=trimesh.creation.box((4e-3, 6e-3, 2e-3)),
+        symmetries=np.eye(3)[None],
+        stable_poses=tuple(
+            StablePose(index=i, R_table_part=R, t_table_part=np.array([0.0, 0.0, h]), probability=0.5, view_class=i)
+            for i, (R, h) in enumerate(zip(rotations, heights, strict=True))
+        ),
+        keypoints=np.zeros((8, 3)),
+        mesh_hash="0" * 16,
+    )
+
+
+PARTS = [part(4), part(9)]
+
+
+def pose_of(k: int) -> Array:
+    return table_from_board(T_CAM_BOARD) @ planar(X, Y, YAW) @ PARTS[0].stable_poses[k].T_table_part
+
+
+def write_split(folder: Path, instances: list[list[tuple[int, int]]], size: int = SIZE) -> Path:
+    """A split with one image per list of (obj_id, stable_pose); instance k is a 5-pixel square at (10 k, 8)."""
+    chunk = folder / "000000"
+    for name in ("rgb", "mask_visib"):
+        (chunk / name).mkdir(parents=True)
+    camera, truth = {}, {}
+    mm = T_CAM_BOARD[:3, 3] * 1e3
+    for i, parts in enumerate(instances):
+        image = np.full((size, size, 3), (10 + i, 20, 30), np.uint8)
+        cv2.imwrite(str(chunk / "rgb" / f"{i:06d}.png"), image[..., ::-1])
+        camera[str(i)] = {
+            "cam_K": WINDOW.matrix.ravel().tolist(),
+            "depth_scale": 0.1,
+            "cam_R_w2c": T_CAM_BOARD[:3, :3].ravel().tolist(),
+            "cam_t_w2c": mm.tolist(),
+        }
+        truth[str(i)] = []
+        for k, (obj_id, stable_pose) in enumerate(parts):
+            mask = np.zeros((size, size), np.uint8)
+            mask[8:13, 10 * k : 10 * k + 5] = 255
+            cv2.imwrite(str(chunk / "mask_visib" / f"{i:06d}_{k:06d}.png"), mask)
+            T = pose_of(stable_pose)
+            truth[str(i)].append(
+                {
+                    "obj_id": obj_id,
+                    "cam_R_m2c": T[:3, :3].ravel().tolist(),
+                    "cam_t_m2c": (T[:3, 3] * 1e3).tolist(),
+                    "stable_pose": stable_pose,
+                }
+            )
+    (chunk / "scene_camera.json").write_text(json.dumps(camera))
+    (chunk / "scene_gt.json").write_text(json.dumps(truth))
+    (folder / "manifest.json").write_text(json.dumps({"images": len(instances), "size": size}))
+    return folder
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return write_split(tmp_path / "train", [[(4, 1), (9, 0)], [], [(9, 0)]])
+
+
+def test_crops_hold_their_first_instance(split: Path) -> None:
+    crops = load_crops(split)
+    assert crops.images.shape == (3, SIZE, SIZE, 3) and crops.images[1, 0, 0].tolist() == [11, 20, 30]
+    assert crops.obj_id.tolist() == [4, 0, 9] and crops.stable_pose.tolist() == [1, -1, 0]
+    np.testing.assert_allclose(crops.T_cam_part[0], pose_of(1), atol=1e-12)
+    np.testing.assert_allclose(crops.T_cam_board, np.stack([T_CAM_BOARD] * 3), atol=1e-12)
+    masks = crops.masks()
+    assert masks.shape == (3, SIZE, SIZE) and masks.sum((1, 2)).tolist() == [25, 0, 25]
+    assert masks[0, 8:13, :5].all()
+    np.testing.assert_array_equal(crops.masks(np.array([2, 0])), masks[[2, 0]])
+
+
+def test_resting_poses_come_back_from_the_poses(split: Path) -> None:
+    labels = load_crops(split).labels(PARTS)
+    assert labels.part_index.tolist() == [0, -1, 1]
+    for m in (0, 2):
+        np.testing.assert_allclose([labels.x[m], labels.y[m], labels.yaw[m]], [X, Y, YAW], atol=1e-9)
+    assert np.isnan(labels.yaw[1]) and np.isnan(labels.centre_px[1]).all()
+    T_cam_table = table_from_board(T_CAM_BOARD)
+    for z, seen in ((0.0, labels.centre_px[0]), (2e-3, labels.body_px[0])):
+        np.testing.assert_allclose(seen, WINDOW.project((T_cam_table @ [X, Y, z, 1.0])[:3]), atol=1e-6)
+
+
+def test_windows_hold_all_instances(split: Path) -> None:
+    windows = load_windows(split)
+    assert len(windows) == 3
+    assert [rows.tolist() for rows in windows.instances_of] == [[0, 1], [], [2]]
+    assert windows.image_index.tolist() == [0, 0, 2] and windows.obj_id.tolist() == [4, 9, 9]
+    assert np.bincount(windows.instance_map[0].ravel()).tolist() == [SIZE * SIZE - 50, 25, 25]
+    assert windows.instance_map[0, 8, 10] == 2 and not windows.instance_map[1].any()
+    assert windows.labels(PARTS).yaw == pytest.approx([YAW] * 3)
+
+
+def test_the_cache_gives_the_same_and_follows_the_manifest(split: Path) -> None:
+    first = load_windows(split)
+    (split / "000000" / "scene_gt.json").unlink()
+    again = load_windows(split)
+    np.testing.assert_array_equal(first.images, again.images)
+    np.testing.assert_array_equal(first.T_cam_part, again.T_cam_part)
+    (split / "manifest.json").write_text("{}")
+    with pytest.raises(PerceptionError, match="scene_gt"):
+        load_windows(split)
+
+
+def test_a_split_without_manifest_is_not_read(split: Path) -> None:
+    (split / "manifest.json").unlink()
+    with pytest.raises(PerceptionError, match=r"no manifest.json in .*did not finish"):
+        load_crops(split)
+
+
+def test_missing_files_and_wrong_sizes_are_named(split: Path) -> None:
+    path = split / "000000" / "mask_visib" / "000002_000000.png"
+    content = path.read_bytes()
+    path.unlink()
+    with pytest.raises(PerceptionError, match=r"000002_000000\.png is missing"):
+        load_crops(split)
+    path.write_bytes(content)
+    cv2.imwrite(str(split / "000000" / "rgb" / "000001.png"), np.zeros((8, 9, 3), np.uint8))
+    with pytest.raises(PerceptionError, match=r"image 1 .* is 9 x 8"):
+        load_crops(split)
+    (split / "000000" / "rgb" / "000001.png").unlink()
+    with pytest.raises(PerceptionError, match=r"no image 000001"):
+        load_crops(split)
+
+
+def test_parts_and_faces_that_do_not_exist_are_named(split: Path) -> None:
+    windows = load_windows(split)
+    with pytest.raises(PerceptionError, match=r"obj_id \[9\].*4 \(block4\)"):
+        windows.labels(PARTS[:1])
+    windows.stable_pose[0] = 7
+    with pytest.raises(PerceptionError, match="stable pose 7 of block4, which has 2"):
+        windows.labels(PARTS)
+
+
+def test_camera_of_a_crop_is_the_crop_of_the_camera() -> None:
+    """What the labels rest on: a point projects to the same place of the window whichever way its camera is made."""
+    whole = Intrinsics(width=5472, height=3648, fx=BASLER.fx, fy=BASLER.fy, cx=BASLER.cx, cy=BASLER.cy)
+    p = np.array([0.001, 0.002, 0.7])
+    np.testing.assert_allclose(WINDOW.project(p), (whole.project(p) - [2700, 1700] + 0.5) / 2 - 0.5)
