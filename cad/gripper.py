@@ -7,6 +7,9 @@ Frame ``flange`` is the arm's flange. Frame ``tcp`` lies between the fingertips 
 
 from __future__ import annotations
 
+import numpy as np
+
+from cad.primitives import Primitive, box_between, cylinder_between
 from cad.spatial import Array, transform
 
 # Published: Robotiq, "Hand-E Gripper Instruction Manual", section 6 (specifications).
@@ -72,6 +75,50 @@ PAD_HALF_EXTENTS_M = (PAD_THICKNESS_M / 2, PAD_WIDTH_M / 2, PAD_HEIGHT_M / 2)
 FINGER_RANGE_M = (0.0, STROKE_M / 2)
 """Range of each finger's slide joint: 0 closed, 25 mm fully open."""
 HAND_MASS_KG = COUPLING_MASS_KG + BODY_MASS_KG + 2 * (CARRIAGE_MASS_KG + FINGER_MASS_KG)
+
+RACK_WIDTH_M = 0.025
+RACK_DEPTH_M = 0.0085
+"""The slider under a carriage, in the body's groove."""
+NECK_STEPS = 3
+"""Boxes that enclose the taper between the blade and the carriage."""
+
+
+def _finger_collision(side: str, sign: float) -> list[Primitive]:
+    """Rack, carriage, neck and blade of one finger; ``sign`` is the side of the pad plane on which it lies."""
+    body = f"hande_{side}"
+    root, top = -FINGER_LENGTH_M, -FINGER_LENGTH_M - CARRIAGE_HEIGHT_M
+
+    def solid(
+        name: str, x: tuple[float, float], width: float, z: tuple[float, float], *, pad: bool = False
+    ) -> Primitive:
+        low, high = (sign * x[0], -width / 2, z[0]), (sign * x[1], width / 2, z[1])
+        return box_between(name, body, low, high, touches=pad)
+
+    steps = np.linspace(0.0, 1.0, NECK_STEPS + 1)
+    heights = -PAD_HEIGHT_M + (root + PAD_HEIGHT_M) * steps
+    thicknesses = PAD_THICKNESS_M + (FINGER_ROOT_THICKNESS_M - PAD_THICKNESS_M) * steps
+    widths = PAD_WIDTH_M + (FINGER_ROOT_WIDTH_M - PAD_WIDTH_M) * steps
+    neck = [
+        solid(f"hand_{side}_neck_{i}", (PAD_COATING_M, thicknesses[i + 1]), widths[i + 1], (heights[i + 1], heights[i]))
+        for i in range(NECK_STEPS)
+    ]
+    return [
+        solid(f"pad_{side}", (0.0, PAD_THICKNESS_M), PAD_WIDTH_M, (-PAD_HEIGHT_M, 0.0), pad=True),
+        *neck,
+        solid(f"hand_{side}_carriage", (CARRIAGE_GAP_M, CARRIAGE_LENGTH_M), CARRIAGE_WIDTH_M, (top, root)),
+        solid(f"hand_{side}_rack", (CARRIAGE_GAP_M, CARRIAGE_LENGTH_M), RACK_WIDTH_M, (top - RACK_DEPTH_M, top)),
+    ]
+
+
+COLLISION = (
+    cylinder_between(
+        "hand_body", "hande_base", (0, 0, 0), (0, 0, COUPLING_HEIGHT_M + BODY_HEIGHT_M), BODY_RADIUS_M + 0.0003
+    ),
+    box_between("hand_plug", "hande_base", (-0.0092, 0.030, 0.001), (0.0092, 0.0427, 0.0092)),
+    *_finger_collision("left", 1.0),
+    *_finger_collision("right", -1.0),
+)
+"""Solids that enclose coupling, body and fingers; ``pad_left`` and ``pad_right`` are the blades exactly."""
 
 
 def opening_from_counts(counts: float) -> float:

@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from cad.parts import CadError
-from cad.spatial import Array, apply, inverse
+from cad.spatial import Array, apply, inverse, transform
 
 Kind = Literal["capsule", "cylinder", "box"]
 SIZES = {"capsule": 2, "cylinder": 2, "box": 3}
@@ -54,3 +55,27 @@ class Primitive:
         else:
             q = np.abs(p) - np.array(self.size)
         return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
+
+
+def cylinder_between(name: str, body: str, start: ArrayLike, end: ArrayLike, radius: float) -> Primitive:
+    """Cylinder of ``radius`` whose end faces are centred at ``start`` and ``end`` (3,), metres in the body frame.
+
+    Raises PrimitiveError when the two points coincide.
+    """
+    p, q = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    length = float(np.linalg.norm(q - p))
+    if length == 0:
+        raise PrimitiveError(f"{name}: both ends are at {p.tolist()}; a cylinder needs two different points")
+    R = Rotation.align_vectors([(q - p) / length], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    return Primitive(
+        name=name, body=body, kind="cylinder", size=(radius, length / 2), T_body_geom=transform(R, (p + q) / 2)
+    )
+
+
+def box_between(name: str, body: str, low: ArrayLike, high: ArrayLike, *, touches: bool = False) -> Primitive:
+    """Box parallel to the body frame's axes with opposite corners ``low`` and ``high`` (3,) in metres, in any order."""
+    p, q = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    x, y, z = (float(v) for v in np.abs(q - p) / 2)
+    return Primitive(
+        name=name, body=body, kind="box", size=(x, y, z), T_body_geom=transform(t=(p + q) / 2), touches=touches
+    )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cad.parts import CadError
+from cad.primitives import Primitive, box_between, cylinder_between
 from cad.spatial import Array, inverse, wrap_angle
 
 
@@ -102,6 +103,41 @@ LINK_INERTIAS = (
 )
 """Links 1..6. Masses and centres of mass: Universal Robots, "DH parameters for calculations of kinematics and
 dynamics". Moments are ours: solid cylinders along each link's long axis, of the housings' outer size."""
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+
+
+def _housing(
+    link: int, name: str, axis: str, low: float, high: float, radius: float, *, x: float = 0.0, z: float = 0.0
+) -> Primitive:
+    """Cylinder of a link between two heights in mm along one of the frame's axes, that axis shifted to (x, z) in mm."""
+    ends = np.tile([x, 0.0, z], (2, 1))
+    ends[:, _AXES[axis]] = low, high
+    body = BODY_NAMES[link]
+    label = f"arm_{body.removeprefix('ur5e_')}_{name}"
+    return cylinder_between(label, body, ends[0] * 1e-3, ends[1] * 1e-3, radius * 1e-3)
+
+
+COLLISION = (
+    _housing(0, "foot", "z", 0, 12, 74.8),
+    _housing(0, "column", "z", 0, 90, 60.3),
+    box_between("arm_base_connector", "ur5e_base", (-0.0693, -0.0222, 0.0198), (0.0, 0.0222, 0.0522)),
+    _housing(1, "upright", "y", -72.5, 61.2, 60.3),
+    _housing(1, "stub", "z", 0, 72, 58.3),
+    _housing(2, "shoulder", "z", 72, 201.2, 60.3, x=425),
+    _housing(2, "elbow", "z", 64, 201.2, 55.3),
+    _housing(2, "tube", "x", 40, 385, 50.3, z=129),
+    _housing(3, "elbow", "z", -50.2, 64, 55.3, x=392.2),
+    _housing(3, "wrist", "z", -34.2, 64, 43.3),
+    _housing(3, "tube", "x", 30, 350, 44.3, z=7),
+    _housing(4, "upright", "y", -69.3, 53.2, 43.3),
+    _housing(4, "stub", "z", 0, 50, 41.3),
+    _housing(5, "upright", "y", -53.2, 49.7, 43.3),
+    _housing(5, "stub", "z", 0, 50, 38.3),
+    _housing(6, "drum", "z", -49.6, 0, 37.8),
+    _housing(6, "connector", "y", 30, 43.7, 7.3, z=-24),
+)
+"""Solids that enclose the housings of ``cad.models.ur5e``, each in its link's frame."""
 
 
 def forward_kinematics(q: ArrayLike, dh: DhTable = UR5E) -> Array:

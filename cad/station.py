@@ -1,16 +1,16 @@
 """What stands still in the cell: camera with its lens, stand, tray and table. Dimensions and collision solids.
 
-Body frames. ``camera_body``: OpenCV's camera frame, origin at the optical centre, +z towards the scene. ``stand``: world
-axes, origin at the foot of the column on the table. ``tray``: origin at the centre of the top face, +z up. ``table``:
-world axes, origin at the robot's base on the table's top face.
+Body frames. ``camera_body``: OpenCV's camera frame, origin at the optical centre, +z towards the scene. ``stand``:
+world axes, origin at the foot of the column on the table. ``tray``: origin at the centre of the top face, +z up.
+``table``: world axes, origin at the robot's base on the table's top face.
 """
 
 from __future__ import annotations
 
-from cad.primitives import Primitive
-from cad.spatial import Array, rotation_y, transform
+from cad.primitives import Primitive, box_between
 
-# Basler acA5472-17uc, product page: 29.3 x 29 x 29 mm without lens mount and connectors, 48.2 mm long with them, C-mount.
+# Basler ace U with USB 3.0 (acA5472-17uc), product documentation: C-mount, 29.3 x 29 x 29 mm without lens mount and
+# connectors, 48.2 x 29 x 29 mm with them.
 CAMERA_WIDTH_M = 0.029
 CAMERA_LENGTH_M = 0.0293
 CAMERA_LENGTH_WITH_MOUNT_M = 0.0482
@@ -33,10 +33,12 @@ BOOM_REACH_M = 0.400
 """From the column's axis to the camera's axis, along -x."""
 BOOM_OVERHANG_M = 0.030
 """The boom goes on past the camera's axis by this much."""
-BRACKET_GAP_M = 0.0005
+BRACKET_GAP_M = 0.0025
 BRACKET_THICKNESS_M = 0.006
 BRACKET_WIDTH_M = 0.030
 BRACKET_LOW_Z_M = 0.752
+GUSSET_M = 0.070
+"""Legs of the triangle that stiffens the corner of column and boom."""
 FOOT_WIDTH_M = 0.140
 FOOT_HEIGHT_M = 0.012
 
@@ -51,30 +53,29 @@ TABLE_THICKNESS_M = 0.030
 TABLE_HEIGHT_M = 0.75
 
 
-def _solid(name: str, body: str, kind: str, size: tuple[float, ...], centre: tuple[float, float, float]) -> Primitive:
-    return Primitive(name=name, body=body, kind=kind, size=size, T_body_geom=transform(t=centre))
-
-
 def _collision() -> tuple[Primitive, ...]:
-    half = PROFILE_M / 2
-    boom = (PROFILE_M / 2 + BOOM_REACH_M + BOOM_OVERHANG_M) / 2
-    bracket_x = -BOOM_REACH_M + CAMERA_WIDTH_M / 2 + BRACKET_GAP_M + BRACKET_THICKNESS_M / 2
-    bracket_top = BOOM_Z_M - half
-    camera_half = (LENS_FRONT_Z_M - (CAMERA_FRONT_Z_M + MOUNT_LENGTH_M - CAMERA_LENGTH_WITH_MOUNT_M)) / 2
+    half, foot, bracket = PROFILE_M / 2, FOOT_WIDTH_M / 2, BRACKET_WIDTH_M / 2
+    near = -BOOM_REACH_M + CAMERA_WIDTH_M / 2 + BRACKET_GAP_M
+    far = near + BRACKET_THICKNESS_M
+    boom_low, boom_high = BOOM_Z_M - half, BOOM_Z_M + half
+    tip = -BOOM_REACH_M - BOOM_OVERHANG_M
+    back = CAMERA_FRONT_Z_M + MOUNT_LENGTH_M - CAMERA_LENGTH_WITH_MOUNT_M
+    tray_x, tray_y, tray_z = TRAY_SIZE_M
     return (
-        _solid("stand_column", "stand", "box", (half, half, COLUMN_HEIGHT_M / 2), (0.0, 0.0, COLUMN_HEIGHT_M / 2)),
-        _solid("stand_foot", "stand", "box", (FOOT_WIDTH_M / 2, FOOT_WIDTH_M / 2, FOOT_HEIGHT_M / 2), (0.0, 0.0, 0.006)),
-        _solid("stand_boom", "stand", "box", (boom, half, half), (half - boom, 0.0, BOOM_Z_M)),
-        _solid(
-            "stand_bracket",
-            "stand",
-            "box",
-            (BRACKET_THICKNESS_M / 2, BRACKET_WIDTH_M / 2, (bracket_top - BRACKET_LOW_Z_M) / 2),
-            (bracket_x, 0.0, (bracket_top + BRACKET_LOW_Z_M) / 2),
+        box_between("stand_foot", "stand", (-foot, -foot, 0.0), (foot, foot, FOOT_HEIGHT_M)),
+        box_between("stand_column", "stand", (-half, -half, 0.0), (half, half, COLUMN_HEIGHT_M)),
+        box_between("stand_boom", "stand", (tip, -half, boom_low), (half, half, boom_high)),
+        box_between("stand_bracket", "stand", (near, -bracket, BRACKET_LOW_Z_M), (far, bracket, boom_low)),
+        box_between("stand_gusset", "stand", (-GUSSET_M - half, -0.008, boom_low - GUSSET_M), (-half, 0.008, boom_low)),
+        box_between(
+            "stand_camera",
+            "camera_body",
+            (-LENS_RADIUS_M, -LENS_RADIUS_M, back),
+            (LENS_RADIUS_M, LENS_RADIUS_M, LENS_FRONT_Z_M),
         ),
-        _solid("stand_camera", "camera_body", "box", (0.0165, 0.0165, camera_half), (0.0, 0.0, LENS_FRONT_Z_M - camera_half)),
-        _solid("tray", "tray", "box", tuple(v / 2 for v in TRAY_SIZE_M), (0.0, 0.0, -TRAY_SIZE_M[2] / 2)),
+        box_between("tray", "tray", (-tray_x / 2, -tray_y / 2, -tray_z), (tray_x / 2, tray_y / 2, 0.0)),
     )
 
 
 COLLISION = _collision()
+"""Solids that enclose camera, stand and tray, each in its body's frame; the table is a plane or box of the scene's."""

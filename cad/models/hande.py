@@ -6,7 +6,7 @@ the body's contours are ours, after photographs: a round body with two flats and
 
 from __future__ import annotations
 
-from build123d import Axis, Polyline, Pos, Rot, Shape, chamfer, loft, make_face
+from build123d import Axis, Polyline, Pos, Rot, Shape, chamfer, loft, make_face  # pyright: ignore[reportMissingImports]
 
 from cad import gripper
 from cad.models.solids import Finish, Piece, barrel, box
@@ -17,12 +17,28 @@ STEEL = Finish(rgba=(0.62, 0.63, 0.65, 1.0), metallic=0.9, roughness=0.3)
 ALUMINIUM = Finish(rgba=(0.80, 0.81, 0.82, 1.0), metallic=0.7, roughness=0.4)
 COATING = Finish(rgba=(0.72, 0.36, 0.10, 1.0), metallic=0.0, roughness=0.8)
 
+
+def _mm(*lengths_m: float) -> tuple[float, ...]:
+    return tuple(1e3 * v for v in lengths_m)
+
+
+GAP, LENGTH, WIDTH, HEIGHT = _mm(
+    gripper.CARRIAGE_GAP_M, gripper.CARRIAGE_LENGTH_M, gripper.CARRIAGE_WIDTH_M, gripper.CARRIAGE_HEIGHT_M
+)
+ROOT_Z = -1e3 * gripper.FINGER_LENGTH_M
+BLADE, BLADE_WIDTH, BLADE_HEIGHT, COAT = _mm(
+    gripper.PAD_THICKNESS_M, gripper.PAD_WIDTH_M, gripper.PAD_HEIGHT_M, gripper.PAD_COATING_M
+)
+ROOT, ROOT_WIDTH = _mm(gripper.FINGER_ROOT_THICKNESS_M, gripper.FINGER_ROOT_WIDTH_M)
+
+RACK_WIDTH, RACK_DEPTH = _mm(gripper.RACK_WIDTH_M, gripper.RACK_DEPTH_M)
 COUPLING_TOP = 1e3 * gripper.COUPLING_HEIGHT_M
 BODY_TOP = 1e3 * (gripper.COUPLING_HEIGHT_M + gripper.BODY_HEIGHT_M)
 RADIUS = 1e3 * gripper.BODY_RADIUS_M
 FLAT_Y, SHOULDER_Z = 29.0, 66.0
 """The flats' distance from the axis and the height from the flange at which they begin."""
-GROOVE_WIDTH, GROOVE_DEPTH = 26.0, 9.0
+GROOVE_CLEARANCE = 0.5
+"""Between the rack and each wall of the groove."""
 BAND_Z = 58.0
 
 
@@ -47,30 +63,17 @@ def _base() -> list[Piece]:
     body = barrel(RADIUS, COUPLING_TOP + 0.8, BODY_TOP, round_low=1, round_high=4)
     for y in ((-60, -FLAT_Y), (FLAT_Y, 60)):
         body -= box((-60, 60), y, (SHOULDER_Z, BODY_TOP + 1))
-    body -= box((-60, 60), (-GROOVE_WIDTH / 2, GROOVE_WIDTH / 2), (BODY_TOP - GROOVE_DEPTH, BODY_TOP + 1))
+    half, depth = RACK_WIDTH / 2 + GROOVE_CLEARANCE, RACK_DEPTH + GROOVE_CLEARANCE
+    body -= box((-60, 60), (-half, half), (BODY_TOP - depth, BODY_TOP + 1))
     band = barrel(RADIUS + 0.25, BAND_Z - 1.5, BAND_Z + 1.5) - barrel(RADIUS - 1, BAND_Z - 3, BAND_Z + 3)
     parts = (("coupling", coupling, GREY), ("seam", seam, BLACK), ("body", body, BLACK), ("band", band, ALUMINIUM))
     return [Piece(name=f"hande_{n}", body="hande_base", shape=s, finish=f) for n, s, f in parts]
 
 
-def _mm(*lengths_m: float) -> tuple[float, ...]:
-    return tuple(1e3 * v for v in lengths_m)
-
-
-GAP, LENGTH, WIDTH, HEIGHT = _mm(
-    gripper.CARRIAGE_GAP_M, gripper.CARRIAGE_LENGTH_M, gripper.CARRIAGE_WIDTH_M, gripper.CARRIAGE_HEIGHT_M
-)
-ROOT_Z = -1e3 * gripper.FINGER_LENGTH_M
-BLADE, BLADE_WIDTH, BLADE_HEIGHT, COAT = _mm(
-    gripper.PAD_THICKNESS_M, gripper.PAD_WIDTH_M, gripper.PAD_HEIGHT_M, gripper.PAD_COATING_M
-)
-ROOT, ROOT_WIDTH = _mm(gripper.FINGER_ROOT_THICKNESS_M, gripper.FINGER_ROOT_WIDTH_M)
-
-
 def _rack() -> Shape:
     """The slider in the body's groove, in the left finger's frame."""
     top = ROOT_Z - HEIGHT
-    return box((GAP + 1, LENGTH - 2), (-GROOVE_WIDTH / 2 + 0.5, GROOVE_WIDTH / 2 - 0.5), (top - GROOVE_DEPTH + 0.5, top))
+    return box((GAP, LENGTH), (-RACK_WIDTH / 2, RACK_WIDTH / 2), (top - RACK_DEPTH, top))
 
 
 def _carriage() -> Shape:

@@ -11,7 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from build123d import Axis, Box, Color, Compound, Cylinder, GeomType, Pos, Shape, Solid, export_step, fillet
+from build123d import (  # pyright: ignore[reportMissingImports]
+    Axis,
+    Box,
+    Color,
+    Compound,
+    Cylinder,
+    GeomType,
+    Pos,
+    Shape,
+    Solid,
+    export_step,
+    fillet,
+)
+from trimesh.exchange.stl import export_stl
 
 from cad.meshes import mesh_from_triangles
 
@@ -71,7 +84,7 @@ def write_stl(path: Path, shape: Shape) -> int:
     """Write ``shape`` (mm) as a binary STL in metres; returns the number of triangles."""
     vertices, triangles = shape.tessellate(DEFLECTION_MM, ANGULAR_DEFLECTION_RAD)
     mesh = mesh_from_triangles(np.array([tuple(v) for v in vertices]) * 1e-3, triangles)
-    path.write_bytes(mesh.export(file_type="stl"))
+    path.write_bytes(export_stl(mesh))
     return len(mesh.faces)
 
 
@@ -104,4 +117,3 @@ def _entry(piece: Piece) -> dict[str, object]:
         "metallic": finish.metallic,
         "roughness": finish.roughness,
     }
-

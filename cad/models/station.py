@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-from build123d import Axis, Box, Plane, Polyline, Pos, Rot, Shape, chamfer, extrude, make_face
+from build123d import (  # pyright: ignore[reportMissingImports]
+    Axis,
+    Box,
+    Plane,
+    Polyline,
+    Pos,
+    Rot,
+    Shape,
+    chamfer,
+    extrude,
+    make_face,
+)
 
 from cad import station
 from cad.models.solids import Finish, Piece, barrel, box, fuse
@@ -16,8 +27,7 @@ LINE = Finish(rgba=(0.85, 0.86, 0.88, 1.0), metallic=0.0, roughness=0.7)
 TABLE_GREY = Finish(rgba=(0.52, 0.53, 0.54, 1.0), metallic=0.0, roughness=0.6)
 
 FRONT, MOUNT, CAMERA_FRONT, CAMERA_BACK = (
-    1e3 * v
-    for v in (station.LENS_FRONT_Z_M, station.MOUNT_Z_M, station.CAMERA_FRONT_Z_M, station.CAMERA_BACK_Z_M)
+    1e3 * v for v in (station.LENS_FRONT_Z_M, station.MOUNT_Z_M, station.CAMERA_FRONT_Z_M, station.CAMERA_BACK_Z_M)
 )
 LENS_RADIUS, CAMERA_HALF = 1e3 * station.LENS_RADIUS_M, 500 * station.CAMERA_WIDTH_M
 CONNECTOR_BACK = CAMERA_FRONT + 1e3 * (station.MOUNT_LENGTH_M - station.CAMERA_LENGTH_WITH_MOUNT_M)
@@ -85,15 +95,14 @@ def _stand() -> list[Piece]:
     far = near + 1e3 * station.BRACKET_THICKNESS_M
     half = 500 * station.BRACKET_WIDTH_M
     bracket = box((near, far), (-half, half), (1e3 * station.BRACKET_LOW_Z_M, BOOM_Z - HALF_PROFILE))
-    gusset = Plane.XZ * make_face(
-        Polyline((-HALF_PROFILE, BOOM_Z - 20), (-HALF_PROFILE, BOOM_Z - 90), (-90, BOOM_Z - 20), close=True)
-    )
+    corner, leg = (-HALF_PROFILE, BOOM_Z - HALF_PROFILE), 1e3 * station.GUSSET_M
+    triangle = Polyline(corner, (corner[0], corner[1] - leg), (corner[0] - leg, corner[1]), close=True)
     parts = (
         ("foot", box((-foot, foot), (-foot, foot), (0, 1e3 * station.FOOT_HEIGHT_M), rounding=8), BLACK),
         ("column", column, ANODISED),
         ("boom", boom, ANODISED),
         ("bracket", bracket, BLACK),
-        ("gusset", extrude(gusset, 8, both=True), BLACK),
+        ("gusset", extrude(Plane.XZ * make_face(triangle), 8, both=True), BLACK),
     )
     return [Piece(name=f"stand_{n}", body="stand", shape=s, finish=f) for n, s, f in parts]
 
@@ -106,7 +115,7 @@ def _tray() -> list[Piece]:
 
 
 def _table() -> list[Piece]:
-    x, y = (tuple(1e3 * v for v in limits) for limits in (station.TABLE_X_M, station.TABLE_Y_M))
+    x, y = ((1e3 * low, 1e3 * high) for low, high in (station.TABLE_X_M, station.TABLE_Y_M))
     thickness, height = 1e3 * station.TABLE_THICKNESS_M, 1e3 * station.TABLE_HEIGHT_M
     top = box(x, y, (-thickness, 0), rounding=10)
     corners = [(cx, cy) for cx in (x[0] + 80, x[1] - 80) for cy in (y[0] + 80, y[1] - 80)]

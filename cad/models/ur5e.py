@@ -8,7 +8,7 @@ upper arm runs 138 beside the shoulder's centre and the forearm 7, as in the mak
 
 from __future__ import annotations
 
-from build123d import Axis, Cylinder, PolarLocations, Pos, Rot, Shape
+from build123d import Cylinder, PolarLocations, Pos, Rot, Shape  # pyright: ignore[reportMissingImports]
 
 from cad.models.solids import Finish, Piece, barrel, box, fuse
 from cad.robot import UR5E
@@ -27,14 +27,14 @@ RING_WIDTH, RING_STEP = 6.0, 1.5
 """A seam ring's width, and how far it lies below the housings."""
 CAP_HEIGHT = 15.0
 SHOULDER_RADIUS, SHOULDER_TOP, SHOULDER_SEAM = 60.0, 46.0, 72.0
-"""Radius of the first two joints, height of the lid's seat above joint 2's axis, seam of joint 2 beside joint 1's axis."""
+"""Radius of joints 1 and 2, height of the lid's seat above joint 2's axis, seam of joint 2 beside joint 1's axis."""
 UPPER_ARM_OFFSET, UPPER_ARM_BACK = 138.0, 186.0
 ELBOW_RADIUS, ELBOW_SEAM = 55.0, 64.0
 UPPER_TUBE_RADIUS, UPPER_COLLAR_RADIUS = 44.0, 50.0
 FOREARM_OFFSET, FOREARM_BACK = 7.0, -50.0
 FOREARM_TUBE_RADIUS, FOREARM_COLLAR_RADIUS = 37.0, 42.0
 WRIST_RADIUS, WRIST_STUB_RADIUS, WRIST_SEAM = 43.0, 41.0, 50.0
-"""Radius of the wrist joints and of the stub to the next one; seam of the next joint beside this one's axis."""
+"""Radius of the wrist joints and of wrist 1's stub to the next one; seam of the next joint beside this one's axis."""
 FOREARM_SEAM = 64.0
 """Seam of joint 4 beside the forearm's frame."""
 WRIST_BACK = 38.0
@@ -115,17 +115,18 @@ def _wrist(number: int) -> list[Piece]:
     turn = FACING_Y if number == 1 else FACING_MINUS_Y
     upright = turn * barrel(WRIST_RADIUS, seam, WRIST_BACK, round_low=1.5, round_high=2)
     stub_end = WRIST_SEAM - RING_WIDTH
+    radius = WRIST_STUB_RADIUS if number == 1 else FLANGE_RADIUS + 0.5
     return _pieces(
         f"wrist_{number}",
-        body=fuse([upright, barrel(WRIST_STUB_RADIUS, 0, stub_end, round_high=1.5)]),
+        body=fuse([upright, barrel(radius, 0, stub_end, round_high=1)]),
         cap=turn * _cap(WRIST_RADIUS, WRIST_BACK),
-        ring=barrel(WRIST_STUB_RADIUS - RING_STEP, stub_end, WRIST_SEAM),
+        ring=barrel(radius - RING_STEP, stub_end, WRIST_SEAM),
     )
 
 
 def _wrist_3() -> list[Piece]:
     """Frame 6: the flange face is z = 0."""
-    drum = barrel(FLANGE_RADIUS, WRIST_SEAM - D6, -6.5, round_low=1.5, round_high=1.5)
+    drum = barrel(FLANGE_RADIUS, WRIST_SEAM - D6, -6.5, round_low=0.8, round_high=1.5)
     connector = Pos(0, FLANGE_RADIUS - 4, -24) * Rot(-90, 0, 0) * Cylinder(7, 20)
     disc = barrel(FLANGE_DISC_RADIUS, -8, 0)
     disc -= [place * Cylinder(3, 20) for place in PolarLocations(25, 4, 45)]
