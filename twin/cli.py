@@ -144,6 +144,25 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """Save pictures of the cell: from the side, and as its camera sees it."""
+
+    seed: int = 0
+    """Seed of the parts dropped onto the board."""
+    out: Path = Path("runs/view")
+    """Folder for cell.jpg and camera.jpg."""
+    json: bool = False
+    """Print the paths as JSON."""
+
+    def run(self) -> None:
+        """Render and save."""
+        from twin.view import save_views
+
+        written = [str(p) for p in save_views(self.out, seed=self.seed)]
+        print(json.dumps(written) if self.json else "\n".join(written))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Check what Tagcell needs of this machine and print what mends it."""
 
@@ -168,6 +187,7 @@ Verb = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Part, subcommand("part")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Doctor, subcommand("doctor")]
 )
 

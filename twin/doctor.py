@@ -11,9 +11,9 @@ from importlib import metadata
 
 from twin.robot import TwinError
 
-GL_PACKAGES = ("libosmesa6", "libegl1", "libopengl0", "libgl1-mesa-dri")
+GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
 GL_COMMAND = f"apt-get update && apt-get install -y {' '.join(GL_PACKAGES)}"
-_PROBE = "import scenes.gl, mujoco; r = mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8); r.close()"
+_PROBE = "from scenes.gl import make_context; make_context(8, 8)"
 
 
 def gl_works() -> bool:
@@ -58,7 +58,9 @@ def doctor(fix: bool = False) -> dict[str, str]:
             )
         install_gl()
         if not gl_works():
-            raise TwinError(f"rendering still fails after installing {' '.join(GL_PACKAGES)}; try MUJOCO_GL=osmesa")
+            raise TwinError(
+                f"rendering still fails after installing {' '.join(GL_PACKAGES)}; try MUJOCO_GL=osmesa with libosmesa6"
+            )
     report["rendering"] = "works"
     report["cores"] = str(os.cpu_count())
     return report

@@ -19,7 +19,7 @@ from twin.robot import TwinError
 
 TCP_SITE = "tcp"
 BRANCH_WEIGHTS = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 1.0])
-"""What a radian of each joint counts for when the nearest branch is chosen: a big link outweighs a turn of the wrist."""
+"""What a radian of each joint counts for when the nearest branch is chosen: big links outweigh a turn of the wrist."""
 
 
 class IkError(TwinError):
@@ -33,7 +33,8 @@ class IkConfig:
     position_tolerance_m: float = 1e-7
     angle_tolerance: float = 1e-6
     max_iterations: int = 40
-    joint_limit: float = np.pi
+    joint_window: float = np.pi
+    """Joints stay this close to home on either side, so that no joint winds up and each pose has one wrist turn."""
     lm_damping: float = 1.0
 
     def __post_init__(self) -> None:
@@ -56,9 +57,9 @@ class ArmIk:
         joints = [model.joint(name) for name in JOINT_NAMES]
         self._qpos = np.array([j.qposadr[0] for j in joints])
         self._dofs = np.array([j.dofadr[0] for j in joints])
-        for joint in joints:
-            limit = self._config.joint_limit
-            model.jnt_range[joint.id] = np.clip(joint.range, -limit, limit)
+        for joint, home in zip(joints, self._q_home, strict=True):
+            window = self._config.joint_window
+            model.jnt_range[joint.id] = np.clip(joint.range, home - window, home + window)
         self._lower, self._upper = np.array([model.jnt_range[j.id] for j in joints]).T
         self._configuration = mink.Configuration(model)
         self._task = mink.FrameTask(
@@ -100,7 +101,8 @@ class ArmIk:
             raise IkError(f"the asked tool pose is not finite: {np.array2string(T_base_tcp, precision=4)}")
         near = self._q_home if q_near is None else np.asarray(q_near, dtype=np.float64)
         branches = inverse_kinematics(T_base_tcp @ inverse(self._T_flange_tcp), q6_singular=float(near[5]))
-        branches = branches[((branches >= self._lower) & (branches <= self._upper)).all(axis=1)]
+        branches = self._lower + (branches - self._lower) % (2 * np.pi)
+        branches = branches[(branches <= self._upper).all(axis=1)]
         if not len(branches):
             raise IkError(f"{_describe(T_base_tcp)} is out of the arm's reach: no closed-form branch reaches it")
         return self.refine(T_base_tcp, branches[(np.abs(branches - near) @ BRANCH_WEIGHTS).argmin()])

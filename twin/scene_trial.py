@@ -20,6 +20,7 @@ from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.assessment import Beliefs, assess, centre, match, pose_error
 from twin.attempts import Attempt, AttemptFinished, AttemptStarted, Event, Looked
 from twin.controller import PickController
+from twin.nominal import nominal_calibration
 from twin.oracle import OracleEstimator
 from twin.pick_config import PickConfig
 from twin.pictures import annotate, grasp_in_camera, save_picture
@@ -27,7 +28,6 @@ from twin.referee import Referee
 from twin.scorecard import SceneResult
 from twin.sim_camera import SimCamera
 from twin.sim_robot import SimRobot
-from twin.nominal import nominal_calibration
 
 SETTLE_S = 1.0
 """Simulated time after the last pick before the referee judges where the parts lie."""

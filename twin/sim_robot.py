@@ -16,7 +16,7 @@ from cad import gripper, robot
 from cad.spatial import Array
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_arm
-from twin.ik import ArmIk, IkError
+from twin.ik import ArmIk, IkConfig, IkError
 from twin.profiles import JointPath, LinearPath, sample_times, steps_per_period
 from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
 
@@ -58,8 +58,9 @@ class SimRobotConfig:
 class SimRobot:
     """A UR5e with a Hand-E inside a compiled cell; implements :class:`twin.robot.Robot`.
 
-    ``on_step`` is called after every physics step. Raises ProfileError when the control period is not a whole multiple
-    of the model's time step. The arm holds the position it is in when the robot is made.
+    ``on_step`` is called after every physics step; ``ik`` is a solver for this arm around the cell's home pose. Raises
+    ProfileError when the control period is not a whole multiple of the model's time step. The arm holds the position
+    it is in when the robot is made.
     """
 
     def __init__(
@@ -74,7 +75,9 @@ class SimRobot:
         self._model, self._data, self._config = model, data, config or SimRobotConfig()
         self._steps = steps_per_period(self._config.control_period_s, float(model.opt.timestep))
         self.on_step = on_step
-        self.ik = ArmIk(build_arm(cell).compile(), np.array(cell.home_q))
+        arm, q_home = build_arm(cell), np.array(cell.home_q)
+        self.ik = ArmIk(arm.compile(), q_home)
+        self._kinematics = ArmIk(arm.compile(), q_home, IkConfig(joint_window=4 * np.pi))
         joints = [model.joint(name) for name in robot.JOINT_NAMES]
         self._qpos = np.array([j.qposadr[0] for j in joints])
         self._dofs = np.array([j.dofadr[0] for j in joints])
@@ -100,7 +103,7 @@ class SimRobot:
             time_s=float(self._data.time),
             q=q,
             qd=self._data.qvel[self._dofs].copy(),
-            T_base_tcp=self.ik.forward(q),
+            T_base_tcp=self._kinematics.forward(q),
             opening_m=self._opening,
             grip=self._grip_state(),
         )
@@ -111,7 +114,7 @@ class SimRobot:
         self._check_joint_move(target, speed, acceleration)
         path = JointPath(q_start=self._q_target, q_end=target, speed=speed, acceleration=acceleration)
         for fraction in np.linspace(0.0, 1.0, 20):
-            self._check_height(self.ik.forward(path.q_start + fraction * (target - path.q_start)))
+            self._check_height(self._kinematics.forward(path.q_start + fraction * (target - path.q_start)))
         self._follow(path.at, path.duration_s, target)
         return JointMove(q=target, speed=speed, acceleration=acceleration, duration_s=path.duration_s)
 
@@ -120,7 +123,10 @@ class SimRobot:
         target = np.array(T_base_tcp, dtype=np.float64)
         self._check_linear_move(target, speed, acceleration)
         path = LinearPath(
-            T_base_start=self.ik.forward(self._q_target), T_base_end=target, speed=speed, acceleration=acceleration
+            T_base_start=self._kinematics.forward(self._q_target),
+            T_base_end=target,
+            speed=speed,
+            acceleration=acceleration,
         )
         profile = path.profile
         if profile.length > 0.0:
@@ -218,7 +224,7 @@ class SimRobot:
             T_base_tcp = path.at_share(float(share))
             self._check_height(T_base_tcp)
             try:
-                knots.append(self.ik.refine(T_base_tcp, knots[-1]))
+                knots.append(self._kinematics.refine(T_base_tcp, knots[-1]))
             except IkError as error:
                 raise MotionRefused(f"linear move refused: {error}") from error
         spline = CubicSpline(shares, knots)
@@ -272,7 +278,7 @@ class SimRobot:
     def _check_joint_move(self, q: Array, speed: float, acceleration: float) -> None:
         if q.shape != (6,) or not np.isfinite(q).all():
             raise MotionRefused(f"joint target {q} refused: it must be 6 finite angles in rad")
-        low, high = self.ik.joint_limits
+        low, high = self._kinematics.joint_limits
         if (q < low).any() or (q > high).any():
             raise MotionRefused(f"joint target {q.round(4)} rad refused: limits are {low.round(4)} to {high.round(4)}")
         _check_rates("joint", speed, robot.SPEED_LIMIT_RAD_S[0], acceleration, self._config.max_joint_acceleration)
