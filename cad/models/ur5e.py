@@ -26,8 +26,8 @@ BASE_RADIUS, BASE_TOP = 60.0, 84.0
 RING_WIDTH, RING_STEP = 6.0, 1.5
 """A seam ring's width, and how far it lies below the housings."""
 CAP_HEIGHT = 15.0
-SHOULDER_RADIUS, SHOULDER_TOP, SHOULDER_SEAM = 60.0, 46.0, 72.0
-"""Radius of joints 1 and 2, height of the lid's seat above joint 2's axis, seam of joint 2 beside joint 1's axis."""
+SHOULDER_RADIUS, SHOULDER_STUB_RADIUS, SHOULDER_TOP, SHOULDER_SEAM = 60.0, 58.0, 46.0, 72.0
+"""Radius of joints 1 and 2 and of the stub between them, lid's seat above joint 2's axis, seam beside joint 1's axis."""
 UPPER_ARM_OFFSET, UPPER_ARM_BACK = 138.0, 186.0
 ELBOW_RADIUS, ELBOW_SEAM = 55.0, 64.0
 UPPER_TUBE_RADIUS, UPPER_COLLAR_RADIUS = 44.0, 50.0
@@ -62,12 +62,12 @@ def _shoulder() -> list[Piece]:
     low = BASE_TOP + RING_WIDTH - D1
     upright = FACING_Y * barrel(SHOULDER_RADIUS, low, SHOULDER_TOP, round_low=1.5, round_high=3)
     stub_end = SHOULDER_SEAM - RING_WIDTH
-    stub = barrel(SHOULDER_RADIUS - 2, 0, stub_end, round_high=1.5)
+    stub = barrel(SHOULDER_STUB_RADIUS, 0, stub_end, round_high=1.5)
     return _pieces(
         "shoulder",
         body=fuse([upright, stub]),
         cap=FACING_Y * _cap(SHOULDER_RADIUS, SHOULDER_TOP),
-        ring=barrel(SHOULDER_RADIUS - RING_STEP, stub_end, SHOULDER_SEAM),
+        ring=barrel(SHOULDER_STUB_RADIUS - RING_STEP, stub_end, SHOULDER_SEAM),
     )
 
 
