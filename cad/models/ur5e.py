@@ -27,7 +27,7 @@ RING_WIDTH, RING_STEP = 6.0, 1.5
 """A seam ring's width, and how far it lies below the housings."""
 CAP_HEIGHT = 15.0
 SHOULDER_RADIUS, SHOULDER_STUB_RADIUS, SHOULDER_TOP, SHOULDER_SEAM = 60.0, 58.0, 46.0, 72.0
-"""Radius of joints 1 and 2 and of the stub between them, lid's seat above joint 2's axis, seam beside joint 1's axis."""
+"""Radius of joints 1 and 2 and of the stub between them, lid seat above joint 2, seam of joint 2 beside joint 1."""
 UPPER_ARM_OFFSET, UPPER_ARM_BACK = 138.0, 186.0
 ELBOW_RADIUS, ELBOW_SEAM = 55.0, 64.0
 UPPER_TUBE_RADIUS, UPPER_COLLAR_RADIUS = 44.0, 50.0
