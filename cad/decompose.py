@@ -14,7 +14,7 @@ import coacd
 import numpy as np
 import trimesh
 
-from cad.meshes import surface_samples
+from cad.meshes import distance_to_surface, surface_samples
 from cad.parts import CadError
 from cad.spatial import Array
 
@@ -99,9 +99,7 @@ def excess_m(mesh: trimesh.Trimesh, pieces: Iterable[trimesh.Trimesh], samples: 
     points = np.concatenate([surface_samples(piece, samples, rng)[0] for piece in pieces])
     outside = winding_number(mesh, points) < 0.5
     out = np.zeros(len(points))
-    if outside.any():
-        chunks = np.array_split(points[outside], max(1, int(outside.sum()) // _CHUNK))
-        out[outside] = np.concatenate([trimesh.proximity.closest_point_naive(mesh, c)[1] for c in chunks])
+    out[outside] = distance_to_surface(mesh, points[outside])
     return out
 
 

@@ -40,9 +40,7 @@ class PartFacts:
             raise ValueError(f"rgba {self.rgba}, metallic {self.metallic}, roughness {self.roughness}: all in 0 to 1")
 
 
-def write_part_folder(
-    folder: Path, mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], facts: PartFacts
-) -> None:
+def write_part_folder(folder: Path, mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], facts: PartFacts) -> None:
     """Write mesh.ply, hulls/, part.json, symmetries.json and keypoints.json; lengths in metres.
 
     Raises MeshError for a mesh or a hull that bounds no solid. Pieces of an earlier decomposition are removed.

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from cad.meshes import surface_samples
+from cad.meshes import distance_to_surface, surface_samples
 from cad.spatial import Array, rotation_angle, rotation_from_rotvec, transform
 
 RELATIVE_TOLERANCE = 0.01
@@ -111,7 +111,7 @@ class _Checker:
         turned = self.samples @ R.T
         near = self._tree.query(turned)[0]
         doubtful = turned[np.argsort(-near)[:100]]
-        return float(trimesh.proximity.closest_point_naive(self.mesh, doubtful)[1].max())
+        return float(distance_to_surface(self.mesh, doubtful).max())
 
     def may_pass(self, R: Array) -> bool:
         """Cheap test that rejects most rotations that are no symmetry and never one that is."""

@@ -20,8 +20,9 @@ SPEC = (
     "interface): opening 8.34 x 2.56 mm, tongue 6.69 x 0.70 mm, contact pitch 0.50 mm"
 )
 DRAWING = (
-    "Typical published drawing of a through-hole and SMT hybrid USB Type-C receptacle (e.g. GCT USB4105): shell "
-    "8.94 x 3.16 x 7.35 mm, mounting legs 8.64 x 4.18 mm apart, locating pegs of diameter 0.65 mm 5.78 mm apart"
+    "Published drawings of through-hole and SMT hybrid USB Type-C receptacles (Korean Hroparts TYPE-C-31-M-12 and "
+    "alike): shell 8.94 x 3.16 x 7.35 mm, mounting legs 8.64 x 4.18 mm apart, locating pegs of diameter 0.65 mm "
+    "5.78 mm apart"
 )
 
 # Shell (`main`): drawn stainless steel tube of stadium section.

@@ -15,6 +15,8 @@ from cad.models import usb_c as u
 
 ARC_SECTORS = 8
 """Pieces of each half-round side wall: 22.5 degrees, whose inner chord is 25 um proud."""
+ROWS = ("rib", "post", "foot")
+"""Contacts in a row are one piece: nothing in the cell is thin enough to enter the gaps of 0.25 and 0.30 mm."""
 _SLACK_MM = 5e-4  # cells end this far before a face that lies in their boundary
 
 Range = tuple[float, float]
@@ -36,8 +38,7 @@ def pieces(part: str, features: dict[str, list[trimesh.Trimesh]]) -> list[trimes
     """Convex pieces of a part from the meshes of its features, in millimetres like the meshes."""
     out = []
     for feature, meshes in features.items():
-        # The contact ribs stand 0.03 mm proud of the tongue: one slab stands for all of them.
-        solids = [trimesh.util.concatenate(meshes)] if feature == "rib" else meshes
+        solids = [trimesh.util.concatenate(meshes)] if feature in ROWS else meshes
         out += [cut(mesh, planes) for mesh in solids for planes in cells(part, feature)]
     return out
 
