@@ -1,7 +1,7 @@
 """The Hand-E and our fingertips as solids, in millimetres, in the frames of ``cad.gripper``.
 
 Published sizes (coupling, body diameter and height, stroke) and our own (carriages, fingertips) are told apart there;
-the body's contours are ours, after photographs: a round body with two flats and a groove in which the racks slide.
+the body's contours are ours: a round body with two flats and a groove in which the racks slide.
 """
 
 from __future__ import annotations

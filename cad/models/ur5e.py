@@ -2,8 +2,8 @@
 
 Published (Universal Robots, UR5e data sheet and user manual): joint positions (the Denavit-Hartenberg table), footprint
 of diameter 149 with four bolts of 8.5 on a circle of 132, tool flange ISO 9409-1-50-4-M6 (diameter 63, 4 x M6 on 50).
-The other sizes are ours, chosen after photographs so that the housings of neighbouring links meet at their seams. The
-upper arm runs 138 beside the shoulder's centre and the forearm 7, as in the maker's own drawings.
+The other sizes are ours, chosen so that the housings of neighbouring links meet at their seams: the upper arm runs 138
+beside the shoulder's centre and the forearm 7. They shape what is seen, never the kinematics.
 """
 
 from __future__ import annotations
