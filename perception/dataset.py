@@ -1,7 +1,8 @@
 """Reads the rendered training data: BOP layout on disk, arrays in memory, one cache file beside the data.
 
-A split is a folder of 1,000-image chunks ``NNNNNN/`` in BOP layout (millimetres, world = board frame) with our key
-``stable_pose`` in ``scene_gt.json``, and a ``manifest.json`` that is written last. In memory everything is in metres.
+A data set is a folder with a manifest ``dataset.json``, which says how it was made and how many images it has, and one
+split: chunks of images ``SPLIT/NNNNNN/`` in BOP layout (millimetres, world = board frame) with our key ``stable_pose``
+in ``scene_gt.json``. In memory everything is in metres.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from cad.spatial import Array, apply, inverse, transform, yaw_of
 from perception.calibration import table_from_board
 from perception.estimates import PerceptionError
 
-MANIFEST = "manifest.json"
+MANIFEST = "dataset.json"
 CACHE = "cache.npz"
 MAX_INSTANCES = 255
 
@@ -148,34 +149,34 @@ def resting_poses(
     )
 
 
-def manifest_hash(split_dir: Path) -> str:
-    """Hash of a split's manifest, which names the split in caches and weight files."""
-    path = split_dir / MANIFEST
+def manifest_hash(data_dir: Path) -> str:
+    """Hash of a data set's manifest, which names the data in caches and weight files."""
+    path = data_dir / MANIFEST
     if not path.exists():
-        raise PerceptionError(f"no {MANIFEST} in {split_dir}: it is no rendered split, or its rendering did not finish")
+        raise PerceptionError(f"no {MANIFEST} in {data_dir}: it is no rendered data set; render one there first")
     return hash_file(path)
 
 
-def load_crops(split_dir: Path) -> CropSet:
-    """All crops of a split, from the cache beside it when that is of the same manifest."""
-    return _cached(split_dir, CropSet, _read_crops)
+def load_crops(data_dir: Path) -> CropSet:
+    """All crops of a data set, from the cache beside it when that is of the same manifest."""
+    return _cached(data_dir, CropSet, _read_crops)
 
 
-def load_windows(split_dir: Path) -> WindowSet:
-    """All windows or frames of a split, from the cache beside it when that is of the same manifest."""
-    return _cached(split_dir, WindowSet, _read_windows)
+def load_windows(data_dir: Path) -> WindowSet:
+    """All windows or frames of a data set, from the cache beside it when that is of the same manifest."""
+    return _cached(data_dir, WindowSet, _read_windows)
 
 
 Kind = TypeVar("Kind", CropSet, WindowSet)
 
 
-def _cached(split_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> Kind:
-    key, path = f"{kind.__name__} {manifest_hash(split_dir)}", split_dir / CACHE
+def _cached(data_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> Kind:
+    key, path = f"{kind.__name__} {manifest_hash(data_dir)}", data_dir / CACHE
     if path.exists():
         with np.load(path, allow_pickle=False) as stored:
             if str(stored["key"]) == key:
                 return kind(**{f.name: stored[f.name] for f in fields(kind)})
-    loaded = read(split_dir)
+    loaded = read(data_dir)
     aside = path.with_suffix(".part.npz")
     np.savez(aside, key=np.array(key), **{f.name: getattr(loaded, f.name) for f in fields(kind)})
     os.replace(aside, path)
@@ -203,16 +204,19 @@ class _Entry:
         return _read_image(self.chunk / "mask_visib" / name, cv2.IMREAD_GRAYSCALE) > 0
 
 
-def _entries(split_dir: Path) -> list[_Entry]:
-    chunks = sorted(p for p in split_dir.iterdir() if p.is_dir() and re.fullmatch(r"\d{6}", p.name))
-    if not chunks:
-        raise PerceptionError(f"{split_dir} holds no chunk folder like 000000")
+def _entries(data_dir: Path) -> list[_Entry]:
+    manifest = _read_json(data_dir / MANIFEST)
+    chunks = sorted(p for p in (data_dir / manifest["split"]).glob("*") if re.fullmatch(r"\d{6}", p.name))
     out = []
     for chunk in chunks:
         cameras, truth = (_read_json(chunk / name) for name in ("scene_camera.json", "scene_gt.json"))
         if set(cameras) != set(truth):
             raise PerceptionError(f"{chunk}: scene_camera.json has {len(cameras)} images, scene_gt.json {len(truth)}")
         out += [_Entry(chunk, i, cameras[str(i)], truth[str(i)]) for i in sorted(map(int, cameras))]
+    if len(out) != manifest["count"]:
+        raise PerceptionError(
+            f"{data_dir} holds {len(out)} of its {manifest['count']} images: its rendering did not finish; run it again"
+        )
     return out
 
 
@@ -244,7 +248,7 @@ def _read_images(entries: Sequence[_Entry]) -> NDArray[np.uint8]:
             if image.shape != first.shape:
                 raise PerceptionError(
                     f"image {entries[i].image_id} of {entries[i].chunk} is {image.shape[1]} x {image.shape[0]}, the "
-                    f"first one {first.shape[1]} x {first.shape[0]}: all of a split must be of one size"
+                    f"first one {first.shape[1]} x {first.shape[0]}: all must be of one size"
                 )
             out[i] = image
     return out
@@ -255,8 +259,8 @@ def _cameras(entries: Sequence[_Entry]) -> tuple[Array, Array]:
     return np.stack([_pose_m(e.camera, "cam_R_w2c", "cam_t_w2c") for e in entries]), K
 
 
-def _read_crops(split_dir: Path) -> CropSet:
-    entries = _entries(split_dir)
+def _read_crops(data_dir: Path) -> CropSet:
+    entries = _entries(data_dir)
     images = _read_images(entries)
     T_cam_board, K = _cameras(entries)
     targets = [e.instances[0] if e.instances else None for e in entries]
@@ -284,8 +288,8 @@ def _instance_map(entry: _Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
     return out
 
 
-def _read_windows(split_dir: Path) -> WindowSet:
-    entries = _entries(split_dir)
+def _read_windows(data_dir: Path) -> WindowSet:
+    entries = _entries(data_dir)
     images = _read_images(entries)
     T_cam_board, K = _cameras(entries)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

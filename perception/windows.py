@@ -112,10 +112,10 @@ def paste(window: Window, other: Window, rng: np.random.Generator, margin: int =
 
 def recolour(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Another exposure, white balance, contrast, sharpness and noise."""
-    x = image.astype(np.float32)
+    curve = 255.0 * np.linspace(0.0, 1.0, 256) ** np.exp(rng.normal(0.0, 0.2)) * np.exp(rng.normal(0.0, 0.2))
+    x = curve.astype(np.float32)[image]
     if rng.random() < 0.25:
         x = np.repeat(x.mean(axis=2, keepdims=True), 3, axis=2)
-    x = 255.0 * np.power(x / 255.0, np.exp(rng.normal(0.0, 0.2))) * np.exp(rng.normal(0.0, 0.2))
     x *= np.exp(rng.normal(0.0, 0.06, 3)).astype(np.float32)
     if rng.random() < 0.3:
         ramp = np.linspace(-1.0, 1.0, x.shape[1], dtype=np.float32)

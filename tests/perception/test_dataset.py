@@ -52,8 +52,8 @@ def pose_of(k: int) -> Array:
 
 
 def write_split(folder: Path, instances: list[list[tuple[int, int]]], size: int = SIZE) -> Path:
-    """A split with one image per list of (obj_id, stable_pose); instance k is a 5-pixel square at (10 k, 8)."""
-    chunk = folder / "000000"
+    """A data set with one image per list of (obj_id, stable_pose); instance k is a 5-pixel square at (10 k, 8)."""
+    chunk = folder / "val" / "000000"
     for name in ("rgb", "mask_visib"):
         (chunk / name).mkdir(parents=True)
     camera, truth = {}, {}
@@ -83,7 +83,7 @@ def write_split(folder: Path, instances: list[list[tuple[int, int]]], size: int 
             )
     (chunk / "scene_camera.json").write_text(json.dumps(camera))
     (chunk / "scene_gt.json").write_text(json.dumps(truth))
-    (folder / "manifest.json").write_text(json.dumps({"images": len(instances), "size": size}))
+    (folder / "dataset.json").write_text(json.dumps({"split": "val", "count": len(instances)}))
     return folder
 
 
@@ -127,32 +127,35 @@ def test_windows_hold_all_instances(split: Path) -> None:
 
 def test_the_cache_gives_the_same_and_follows_the_manifest(split: Path) -> None:
     first = load_windows(split)
-    (split / "000000" / "scene_gt.json").unlink()
+    (split / "val" / "000000" / "scene_gt.json").unlink()
     again = load_windows(split)
     np.testing.assert_array_equal(first.images, again.images)
     np.testing.assert_array_equal(first.T_cam_part, again.T_cam_part)
-    (split / "manifest.json").write_text("{}")
+    (split / "dataset.json").write_text(json.dumps({"split": "val", "count": 3, "seed": 2}))
     with pytest.raises(PerceptionError, match="scene_gt"):
         load_windows(split)
 
 
-def test_a_split_without_manifest_is_not_read(split: Path) -> None:
-    (split / "manifest.json").unlink()
-    with pytest.raises(PerceptionError, match=r"no manifest.json in .*did not finish"):
+def test_a_data_set_without_manifest_or_unfinished_is_not_read(split: Path) -> None:
+    (split / "dataset.json").write_text(json.dumps({"split": "val", "count": 500}))
+    with pytest.raises(PerceptionError, match="holds 3 of its 500 images"):
+        load_crops(split)
+    (split / "dataset.json").unlink()
+    with pytest.raises(PerceptionError, match=r"no dataset\.json in "):
         load_crops(split)
 
 
 def test_missing_files_and_wrong_sizes_are_named(split: Path) -> None:
-    path = split / "000000" / "mask_visib" / "000002_000000.png"
+    path = split / "val" / "000000" / "mask_visib" / "000002_000000.png"
     content = path.read_bytes()
     path.unlink()
     with pytest.raises(PerceptionError, match=r"000002_000000\.png is missing"):
         load_crops(split)
     path.write_bytes(content)
-    cv2.imwrite(str(split / "000000" / "rgb" / "000001.png"), np.zeros((8, 9, 3), np.uint8))
+    cv2.imwrite(str(split / "val" / "000000" / "rgb" / "000001.png"), np.zeros((8, 9, 3), np.uint8))
     with pytest.raises(PerceptionError, match=r"image 1 .* is 9 x 8"):
         load_crops(split)
-    (split / "000000" / "rgb" / "000001.png").unlink()
+    (split / "val" / "000000" / "rgb" / "000001.png").unlink()
     with pytest.raises(PerceptionError, match=r"no image 000001"):
         load_crops(split)
 
