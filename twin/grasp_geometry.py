@@ -86,25 +86,49 @@ def closing_axes(yaw: float) -> tuple[Array, Array]:
     return np.array([c, s, 0.0]), np.array([s, -c, 0.0])
 
 
-def pad_contact(
-    samples: SurfaceSamples, yaw: float, b_centre_m: float, strip: PadStrip, rules: ContactRules
-) -> PadContact | str:
-    """The flat contact of two pads closing along ``yaw`` with their middle at ``b_centre_m``, or why there is none.
+@dataclass(frozen=True, kw_only=True)
+class JawView:
+    """Samples between the heights of a strip, sorted by b: distance along a and b, height, facing = normal . a."""
 
-    ``samples`` are in the table frame. Each pad stops at the extreme point in the strip; the samples within
-    ``rules.face_depth_m`` of it whose normal faces the pad carry the contact.
-    """
+    a: Array
+    b: Array
+    z: Array
+    facing: Array
+    area_m2: float
+
+
+def view_along(samples: SurfaceSamples, yaw: float, strip: PadStrip) -> JawView:
+    """What pads that close along ``yaw`` can touch of ``samples``, which are in the table frame."""
     axis_a, axis_b = closing_axes(yaw)
-    a, b, z = samples.points @ axis_a, samples.points @ axis_b, samples.points[:, 2]
-    inside = (np.abs(b - b_centre_m) <= strip.half_width_m) & (z >= strip.z_low_m) & (z <= strip.z_high_m)
-    if inside.sum() < 10:
+    z = samples.points[:, 2]
+    inside = np.nonzero((z >= strip.z_low_m) & (z <= strip.z_high_m))[0]
+    b = samples.points[inside] @ axis_b
+    order = np.argsort(b)
+    inside = inside[order]
+    return JawView(
+        a=samples.points[inside] @ axis_a,
+        b=b[order],
+        z=z[inside],
+        facing=samples.normals[inside] @ axis_a,
+        area_m2=samples.area_m2,
+    )
+
+
+def pad_contact(view: JawView, b_centre_m: float, strip: PadStrip, rules: ContactRules) -> PadContact | str:
+    """The flat contact of two pads with their middle at ``b_centre_m``, or why there is none.
+
+    Each pad stops at the extreme point in the strip; the samples within ``rules.face_depth_m`` of it whose normals face
+    the pad carry the contact.
+    """
+    low, high = np.searchsorted(view.b, [b_centre_m - strip.half_width_m, b_centre_m + strip.half_width_m])
+    if high - low < 10:
         return "nothing between the pads"
-    a, b, z, facing = a[inside], b[inside], z[inside], samples.normals[inside] @ axis_a
+    a, b, z, facing = view.a[low:high], view.b[low:high], view.z[low:high], view.facing[low:high]
     a_min, a_max = float(a.min()), float(a.max())
     cos_limit = np.cos(rules.normal_tolerance)
     right = (a > a_max - rules.face_depth_m) & (facing > cos_limit)
     left = (a < a_min + rules.face_depth_m) & (facing < -cos_limit)
-    area = min(right.sum(), left.sum()) * samples.area_m2
+    area = min(right.sum(), left.sum()) * view.area_m2
     if area < rules.min_area_m2:
         return "no flat face on one side"
     b_low, b_high = max(b[right].min(), b[left].min()), min(b[right].max(), b[left].max())

@@ -28,6 +28,7 @@ from twin.grasp_geometry import (
     sample_surface,
     support_points,
     topples,
+    view_along,
 )
 from twin.robot import TwinError
 
@@ -43,6 +44,7 @@ class GraspConfig:
     yaw_step: float = np.deg2rad(5.0)
     lateral_step_m: float = 0.5e-3
     lateral_reach_m: float = 4.0e-3
+    distinct_m: float = 0.9e-3
     tip_clearance_m: float = 0.15e-3
     sample_spacing_m: float = 0.08e-3
     clearance_m: float = 3.0e-3
@@ -129,23 +131,28 @@ def find_grasps(part: Part, stable_pose: StablePose, config: GraspConfig | None 
     com = R @ part.mesh.center_mass + t
     base = support_points(part.mesh, stable_pose.T_table_part)
     rejections: Counter[str] = Counter()
-    found: list[Grasp] = []
+    found: list[tuple[float, float, Grasp]] = []
     for yaw in np.arange(0.0, np.pi - 1e-9, config.yaw_step):
-        best: Grasp | None = None
+        view = view_along(samples, yaw, config.strip)
         for b in _lateral_offsets(com, yaw, config):
-            contact = pad_contact(samples, yaw, b, config.strip, config.rules)
+            contact = pad_contact(view, b, config.strip, config.rules)
             reason = contact if isinstance(contact, str) else _unfit(contact, yaw, base, com, config)
             if reason:
                 rejections[reason] += 1
                 continue
             assert isinstance(contact, PadContact)
-            grasp = _grasp(part, stable_pose, yaw, b, contact, com, config)
-            if best is None or grasp.quality > best.quality:
-                best = grasp
-        if best is not None:
-            found.append(best)
-    found.sort(key=lambda g: -g.quality)
-    return GraspSearch(grasps=tuple(found[: config.keep]), rejections=dict(rejections))
+            found.append((float(yaw), float(b), _grasp(part, stable_pose, yaw, b, contact, com, config)))
+    found.sort(key=lambda item: -item[2].quality)
+    return GraspSearch(grasps=tuple(_distinct(found, config)[: config.keep]), rejections=dict(rejections))
+
+
+def _distinct(found: list[tuple[float, float, Grasp]], config: GraspConfig) -> list[Grasp]:
+    """The best grasp of every yaw, and others of that yaw at least ``distinct_m`` away along the pads."""
+    kept: list[tuple[float, float, Grasp]] = []
+    for yaw, b, grasp in found:
+        if all(yaw != other or abs(b - there) >= config.distinct_m for other, there, _ in kept):
+            kept.append((yaw, b, grasp))
+    return [grasp for _, _, grasp in kept]
 
 
 def _lateral_offsets(com: Array, yaw: float, config: GraspConfig) -> Array:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cad.gripper import T_FLANGE_TCP
-from cad.robot import forward_kinematics
+from cad.robot import JOINT_RANGE_RAD, forward_kinematics
 from cad.spatial import apply, rotation_angle
 from scenes.workcell import CellConfig, build_arm
 from twin.ik import ArmIk, IkError, top_down
@@ -53,6 +53,11 @@ def test_solution_is_the_branch_nearest_to_the_asked_joints(ik):
         np.testing.assert_allclose(ik.solve(T, q + rng.normal(0.0, 0.02, 6)), q, atol=1e-5)
 
 
+def test_arm_keeps_its_shape_over_board_and_tray(ik):
+    q = np.array([ik.solve(T) for T in random_targets(np.random.default_rng(4), 25)])
+    assert (np.abs(q - CELL.home_q)[:, :5] < 1.3).all()
+
+
 def test_jacobian_is_the_derivative(ik):
     q, h = np.array(CELL.home_q), 1e-6
     J = ik.jacobian(q)
@@ -62,9 +67,11 @@ def test_jacobian_is_the_derivative(ik):
         np.testing.assert_allclose(J[:3, i], slope, atol=1e-8)
 
 
-def test_joint_limits_are_a_half_turn_each_way(ik):
+def test_joints_stay_within_half_a_turn_of_home_and_inside_the_arms_range(ik):
     low, high = ik.joint_limits
-    np.testing.assert_allclose([low, high], [[-np.pi] * 6, [np.pi] * 6])
+    home = np.array(CELL.home_q)
+    np.testing.assert_allclose(low, np.maximum(home - np.pi, JOINT_RANGE_RAD[0]))
+    np.testing.assert_allclose(high, np.minimum(home + np.pi, JOINT_RANGE_RAD[1]))
 
 
 def test_out_of_reach_is_said_with_the_pose(ik):

@@ -1,0 +1,259 @@
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from cad import gripper
+from cad.parts import StablePose, hash_file, load_part, planar
+from cad.spatial import apply, inverse, rotation_x, rotation_z, transform
+from twin.grasp_geometry import (
+    ContactRules,
+    PadContact,
+    PadStrip,
+    convex_gap,
+    footprint,
+    pad_contact,
+    sample_surface,
+    topples,
+    view_along,
+)
+from twin.grasps import GraspConfig, GraspError, PlacedPart, choose_grasp, find_grasps, read_grasps, write_grasps
+from twin.ik import top_down
+from twin.robot import TwinError
+
+SIZE = np.array([8e-3, 6e-3, 3e-3])
+STRIP = PadStrip(half_width_m=3e-3, z_low_m=0.15e-3, z_high_m=10e-3)
+
+
+def make_part(folder, mesh, name="brick", poses=None):
+    """A part folder of ``mesh`` standing on its lowest face, read back."""
+    (folder / name).mkdir()
+    mesh.export(folder / name / "mesh.ply")
+    height = -float(mesh.bounds[0, 2])
+    poses = poses or [{"R_table_part": np.eye(3).tolist(), "t_table_part_m": [0, 0, height], "probability": 1.0}]
+    info = {
+        "name": name,
+        "obj_id": 9,
+        "mass_kg": 3e-4,
+        "material": "steel",
+        "rgba": [1, 1, 1, 1],
+        "metallic": 1.0,
+        "roughness": 0.5,
+        "mesh_hash": hash_file(folder / name / "mesh.ply"),
+    }
+    (folder / name / "part.json").write_text(json.dumps(info))
+    (folder / name / "keypoints.json").write_text(json.dumps({"keypoints_m": np.zeros((8, 3)).tolist()}))
+    (folder / name / "stable_poses.json").write_text(json.dumps({"stable_poses": poses}))
+    return load_part(name, folder)
+
+
+@pytest.fixture
+def brick(tmp_path):
+    return make_part(tmp_path, trimesh.creation.box(SIZE))
+
+
+def contact_of(mesh, yaw, b=0.0, rules=None):
+    view = view_along(sample_surface(mesh, 0.08e-3), yaw, STRIP)
+    return pad_contact(view, b, STRIP, rules or ContactRules())
+
+
+def test_contact_with_a_box_is_its_faces():
+    box = trimesh.creation.box(SIZE, transform=transform(t=[0, 0, SIZE[2] / 2]))
+    contact = contact_of(box, 0.0)
+    assert isinstance(contact, PadContact)
+    assert contact.width_m == pytest.approx(8e-3, abs=1e-6)
+    assert contact.length_m == pytest.approx(6e-3, abs=0.1e-3)
+    assert contact.height_m == pytest.approx(2.85e-3, abs=0.1e-3)
+    assert contact.area_m2 == pytest.approx(6e-3 * 2.85e-3, rel=0.1)
+    assert contact.flatness_m < 1e-9
+
+
+def test_contact_turns_with_the_part():
+    rng = np.random.default_rng(0)
+    for yaw in rng.uniform(0, np.pi, 5):
+        T = transform(rotation_z(yaw), [0, 0, SIZE[2] / 2])
+        contact = contact_of(trimesh.creation.box(SIZE, transform=T), yaw)
+        assert isinstance(contact, PadContact)
+        assert contact.width_m == pytest.approx(8e-3, abs=1e-6)
+
+
+def test_a_corner_is_no_contact():
+    box = trimesh.creation.box(SIZE, transform=transform(t=[0, 0, SIZE[2] / 2]))
+    assert contact_of(box, np.deg2rad(40.0)) == "no flat face on one side"
+    assert contact_of(box, 0.0, b=0.02) == "nothing between the pads"
+
+
+def test_faces_that_do_not_face_each_other_are_no_contact():
+    lower = trimesh.creation.box([4e-3, 4e-3, 2e-3], transform=transform(t=[-2e-3, -2.1e-3, 1e-3]))
+    upper = trimesh.creation.box([4e-3, 4e-3, 2e-3], transform=transform(t=[2e-3, 2.1e-3, 1e-3]))
+    assert contact_of(trimesh.util.concatenate([lower, upper]), 0.0) == "the flat faces do not face each other"
+
+
+def test_a_high_push_topples_a_narrow_part():
+    base = np.array([[-0.2e-3, 0.0], [0.2e-3, 0.0]])
+    low, high = (
+        PadContact(
+            width_m=1e-3,
+            a_mid_m=0,
+            area_m2=1e-6,
+            length_m=1e-3,
+            height_m=1e-3,
+            b_centre_m=0,
+            z_centre_m=0,
+            z_touch_m=z,
+            flatness_m=0,
+        )
+        for z in (0.15e-3, 5e-3)
+    )
+    com = np.array([0.0, 0.0, 4e-3])
+    assert not topples(low, 0.0, base, com, 0.4)
+    assert topples(high, 0.0, base, com, 0.4)
+
+
+def test_grasps_of_a_brick_close_on_its_faces(brick):
+    grasps = find_grasps(brick, brick.stable_poses[0]).grasps
+    assert {round(g.width_m * 1e3, 3) for g in grasps} == {8.0, 6.0}
+    assert grasps[0].width_m == pytest.approx(6e-3)  # the longer face aligns itself better
+    for grasp in grasps:
+        T_table_tcp = brick.stable_poses[0].T_table_part @ grasp.T_part_tcp
+        np.testing.assert_allclose(T_table_tcp[:3, 2], [0, 0, -1], atol=1e-12)
+        assert T_table_tcp[2, 3] == pytest.approx(GraspConfig().tip_clearance_m)
+        # in the tool's frame the part is centred across the pads, and the opening leaves 3 mm a side
+        across = apply(inverse(grasp.T_part_tcp), brick.mesh.vertices)[:, 0]
+        assert across.max() == pytest.approx(-across.min(), abs=1e-6)
+        assert grasp.opening_m >= across.max() - across.min() + 2 * 3e-3 - 1e-6
+        assert 0 < grasp.quality <= 1
+    assert [g.quality for g in grasps] == sorted((g.quality for g in grasps), reverse=True)
+
+
+def test_flat_faces_rank_above_round_ones(tmp_path):
+    rod = trimesh.creation.cylinder(radius=2e-3, height=6e-3, sections=96)
+    rod.apply_transform(transform(rotation_x(np.pi / 2)))
+    part = make_part(tmp_path, rod, "rod")
+    assert find_grasps(part, part.stable_poses[0]).grasps[0].contact.flatness_m < 1e-6
+
+
+def test_too_wide_says_so(tmp_path):
+    part = make_part(tmp_path, trimesh.creation.box([50e-3, 46e-3, 2e-3]), "slab")
+    coarse = GraspConfig(sample_spacing_m=0.3e-3, yaw_step=np.pi / 6)
+    assert "wider than the gripper opens" in find_grasps(part, part.stable_poses[0], coarse).rejections
+    with pytest.raises(GraspError, match=r"slab.*wider than the gripper opens"):
+        write_grasps(part, coarse)
+
+
+def test_stored_grasps_read_back(brick):
+    write_grasps(brick)
+    stored = read_grasps(load_part("brick", brick.folder.parent))
+    found = find_grasps(brick, brick.stable_poses[0]).grasps
+    assert len(stored) == 1 and len(stored[0]) == len(found)
+    np.testing.assert_allclose(stored[0][0].T_part_tcp, found[0].T_part_tcp, atol=1e-8)
+    assert stored[0][0].width_m == pytest.approx(found[0].width_m, abs=1e-7)
+
+
+def test_missing_or_stale_grasps_are_named(brick):
+    with pytest.raises(GraspError, match="write_grasps"):
+        read_grasps(brick)
+    write_grasps(brick)
+    path = brick.folder / "grasps.json"
+    path.write_text(path.read_text().replace(brick.mesh_hash, "0" * 16))
+    with pytest.raises(GraspError, match="0000"):
+        read_grasps(brick)
+
+
+def test_gap_between_convex_outlines():
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    assert convex_gap(square, square + np.array([1.5, 0.0])) == pytest.approx(0.5)
+    assert convex_gap(square, square + np.array([0.9, 0.2])) == pytest.approx(-0.1)
+    turned = (square - 0.5) @ rotation_z(np.pi / 4)[:2, :2].T + [0.5, 2.0]
+    assert convex_gap(square, turned) == pytest.approx(1.5 - np.sqrt(0.5) - 0.5 + 0.0, abs=1e-9)
+
+
+# -- choosing ---------------------------------------------------------------------------------------------------------
+
+NEST = planar(0.40, 0.25, 0.0)
+
+
+def choose(brick, neighbours=(), nest_neighbours=(), solve=lambda T: np.zeros(6), at=(0.45, 0.0, 0.3)):
+    resting = brick.stable_poses[0].T_table_part
+    target = PlacedPart(part=brick, T_base_part=planar(*at) @ resting)
+    others = [PlacedPart(part=brick, T_base_part=planar(*n) @ resting) for n in neighbours]
+    in_tray = [PlacedPart(part=brick, T_base_part=planar(*n) @ resting) for n in nest_neighbours]
+    if not (brick.folder / "grasps.json").exists():
+        write_grasps(brick)
+    grasps = read_grasps(brick)[0]
+    return target, others, choose_grasp(target, others, NEST @ resting, in_tray, grasps, solve, GraspConfig())
+
+
+def fingers_hit(target, choice, others):
+    """Whether a finger at the opening, or anywhere on its way to the part, overlaps an outline."""
+    T = target.T_base_part @ choice.T_part_tcp
+    for half in np.linspace(choice.grasp.width_m / 2, choice.openings_m[0] / 2, 10):
+        for side in (-1, 1):
+            x = np.array([half, half + gripper.PAD_THICKNESS_M]) * side
+            y = np.array([-0.5, 0.5]) * gripper.PAD_WIDTH_M
+            corners = apply(T, np.array([[x[0], y[0], 0], [x[1], y[0], 0], [x[1], y[1], 0], [x[0], y[1], 0]]))[:, :2]
+            if any(convex_gap(corners, footprint(o.part.mesh, o.T_base_part)) <= 0 for o in others):
+                return True
+    return False
+
+
+def test_alone_the_best_grasp_is_taken_with_full_clearance(brick):
+    _, _, choice = choose(brick)
+    assert choice.grasp.width_m == pytest.approx(6e-3)
+    assert choice.openings_m == (pytest.approx(12e-3), pytest.approx(12e-3))
+
+
+def test_neighbours_are_spared(brick):
+    rng = np.random.default_rng(0)
+    found = 0
+    for _ in range(20):
+        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(9e-3, 14e-3)
+        beside = (0.45 + distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-3, 3))
+        target, others, choice = choose(brick, neighbours=[beside])
+        if isinstance(choice, str):
+            continue
+        found += 1
+        assert not fingers_hit(target, choice, others)
+    assert found >= 10
+
+
+def test_a_part_walled_in_says_why(brick):
+    ring = [(0.45 + 8.5e-3 * np.cos(a), 8.5e-3 * np.sin(a), a) for a in np.linspace(0, 2 * np.pi, 9)[:-1]]
+    assert "neighbour" in choose(brick, neighbours=ring)[2]
+    around_nest = [(0.40 + 8.5e-3 * np.cos(a), 0.25 + 8.5e-3 * np.sin(a), a) for a in np.linspace(0, 2 * np.pi, 9)[:-1]]
+    assert "tray" in choose(brick, nest_neighbours=around_nest)[2]
+
+
+def test_out_of_reach_says_why(brick):
+    def solve(T):
+        raise TwinError("no")
+
+    assert "reach" in choose(brick, solve=solve)[2]
+
+
+def test_the_wrist_turns_at_most_a_quarter_from_zero(brick):
+    def solve(T):
+        x = T[:3, 0]
+        return np.array([0, 0, 0, 0, 0, np.arctan2(x[1], x[0])])
+
+    for yaw in np.linspace(-np.pi, np.pi, 13):
+        target, _, choice = choose(brick, solve=solve, at=(0.45, 0.0, yaw))
+        T = target.T_base_part @ choice.T_part_tcp
+        c, s = T[:2, 0]
+        np.testing.assert_allclose(T, top_down(*T[:3, 3], np.arctan2(s, c)), atol=1e-9)
+        assert abs(choice.q_place[5] - choice.q_pick[5]) <= np.pi
+
+
+def test_stable_poses_have_their_own_grasps(tmp_path):
+    lying, standing = np.eye(3), rotation_x(np.pi / 2)
+    poses = [
+        {"R_table_part": lying.tolist(), "t_table_part_m": [0, 0, 1.5e-3], "probability": 0.6},
+        {"R_table_part": standing.tolist(), "t_table_part_m": [0, 0, 3e-3], "probability": 0.4},
+    ]
+    part = make_part(tmp_path, trimesh.creation.box(SIZE), poses=poses)
+    write_grasps(part)
+    by_pose = read_grasps(load_part("brick", tmp_path))
+    assert all(isinstance(p, StablePose) for p in part.stable_poses)
+    assert by_pose[1][0].width_m == pytest.approx(3e-3, abs=1e-6)
+    assert all(g.stable_pose == k for k, grasps in enumerate(by_pose) for g in grasps)
