@@ -50,7 +50,7 @@ class SegmentationTraining(TrainingConfig):
     """Where the windows are and how they are varied; the rest as in ``TrainingConfig``.
 
     ``start`` names a folder with earlier weights to go on from. ``warp`` is the share of windows that are turned and
-    scaled, ``paste`` the share that get a part of another window in a free place.
+    scaled, ``paste`` the mean number of parts of other windows that are tried in free places of one.
     """
 
     data: Path
@@ -61,7 +61,7 @@ class SegmentationTraining(TrainingConfig):
     batch: int = 8
     learning_rate: float = 3e-3
     warp: float = 0.4
-    paste: float = 0.3
+    paste: float = 2.5
     validate_windows: int = 120
 
 
@@ -112,7 +112,7 @@ def targets_of(window: Window) -> dict[str, NDArray]:
 def example(windows: Windows, rng: np.random.Generator, config: SegmentationTraining) -> Window:
     """A randomly chosen and varied window."""
     window = windows[int(rng.integers(len(windows)))]
-    if rng.random() < config.paste:
+    for _ in range(rng.poisson(config.paste)):
         window = paste(window, flip(windows[int(rng.integers(len(windows)))], rng), rng)
     window = flip(window, rng)
     if rng.random() < config.warp:

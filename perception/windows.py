@@ -89,7 +89,8 @@ def paste(window: Window, other: Window, rng: np.random.Generator, margin: int =
     if min(u.min(), v.min()) < margin or u.max() >= width - margin or v.max() >= height - margin:
         return window
     box = np.s_[v.min() - margin : v.max() + margin + 1, u.min() - margin : u.max() + margin + 1]
-    patch, own = other.image[box], other.instances[box] == k + 1
+    patch, own = other.image[box].astype(np.float32), other.instances[box] == k + 1
+    brightness = np.exp(rng.normal(0.0, 0.25))
     j = int(rng.integers(0, height - own.shape[0] + 1))
     i = int(rng.integers(0, width - own.shape[1] + 1))
     place = np.s_[j : j + own.shape[0], i : i + own.shape[1]]
@@ -99,7 +100,7 @@ def paste(window: Window, other: Window, rng: np.random.Generator, margin: int =
     alpha = cv2.GaussianBlur(own.astype(np.float32), (0, 0), 0.6)[..., None]
     if rng.random() < 0.5:
         alpha = np.maximum(alpha, 0.5 * cv2.GaussianBlur(own.astype(np.float32), (0, 0), 3.0)[..., None])
-    image[place] = (alpha * patch + (1 - alpha) * image[place]).astype(np.uint8)
+    image[place] = np.clip(alpha * brightness * patch + (1 - alpha) * image[place], 0, 255).astype(np.uint8)
     instances[place][own] = len(window.centres) + 1
     shift = np.array([i - box[1].start, j - box[0].start])
     return Window(
