@@ -150,7 +150,7 @@ class Referee:
             tool, thing = int(kinds[row, mine]), int(kinds[row, other])
             if thing >= 0:
                 self._touched.add(thing)
-                if tool in (LEFT_PAD, RIGHT_PAD):
+                if tool in (LEFT_PAD, RIGHT_PAD) and self._squeezes(row):
                     pads.setdefault(thing, set()).add(tool)
             else:
                 self._strike(thing, data.contact.pos[row])
@@ -166,6 +166,11 @@ class Referee:
         return self.records
 
     # -- during an attempt --------------------------------------------------------------------------------------
+
+    def _squeezes(self, row: int) -> bool:
+        """Whether a contact pushes along the closing direction, as the inner face of a pad does, and not sideways."""
+        closing = self._data.site_xmat[self._tcp].reshape(3, 3)[:, 0]
+        return abs(float(self._data.contact.frame[row, :3] @ closing)) > 0.9
 
     def _hold(self, i: int) -> None:
         if i not in self._gripped:
