@@ -109,7 +109,7 @@ def add_board_visuals(
     """Draw the tagboard on ``body``, whose frame is ``board``.
 
     ``background`` (BACKGROUND_SIZE, BACKGROUND_SIZE, 3) uint8 is stretched over the plate; without it the plate is
-    plain light grey.
+    plain light grey. The plate casts no shadow: it could only fall on the plate itself, as noise.
     """
     if background is None:
         background = np.full((BACKGROUND_SIZE, BACKGROUND_SIZE, 3), 205, np.uint8)
@@ -122,7 +122,7 @@ def add_board_visuals(
     texcoords = (plate.vertices[:, :2] * [1, -1] / half + 1) / 2
     normals = np.repeat(plate.face_normals, 3, axis=0)
     add_raw_mesh(spec, "board", plate.vertices, plate.faces, normals=normals, texcoords=texcoords)
-    add_visual(body, "board_visual", "board", material="board")
+    add_visual(body, "board_visual", "board", material="board").castshadow = False
     _add_labels(spec, body, config)
 
 
@@ -152,7 +152,7 @@ def _add_labels(spec: mujoco.MjSpec, body: mujoco.MjsBody, config: TagboardConfi
         normals=np.tile([0.0, 0.0, 1.0], (len(vertices), 1)),
         texcoords=np.array(texcoords) / [columns, rows],
     )
-    add_visual(body, "tags_visual", "tags", material="tags")
+    add_visual(body, "tags_visual", "tags", material="tags").castshadow = False
 
 
 def classic_finish(metallic: float, roughness: float) -> tuple[float, float]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import weakref
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +74,7 @@ class ClassicRenderer:
         self._option.geomgroup[:] = [group in VISUAL_GROUPS for group in range(6)]
         self._option.sitegroup[:] = False
         self._instance_of_geom = instance_of_geom(model)
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
 
     def render(
         self,
@@ -82,7 +84,7 @@ class ClassicRenderer:
         camera: str = CAMERA,
     ) -> Rendering:
         """See :class:`Renderer`. Raises SceneError for a window larger than the renderer was made for."""
-        if self._context is None:
+        if not self._free.alive:
             raise SceneError("this renderer was closed; make a new ClassicRenderer")
         width, height = intrinsics.width, intrinsics.height
         if width > self._size[0] or height > self._size[1]:
@@ -112,12 +114,8 @@ class ClassicRenderer:
         mujoco.mjr_uploadTexture(self._model, self._context, self._model.texture(name).id)
 
     def close(self) -> None:
-        """Free the context; closing twice is harmless."""
-        if self._context is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._context = None
-            self._gl.free()
+        """Free the context, which otherwise happens when the renderer is collected; closing twice is harmless."""
+        self._free()
 
     def __enter__(self) -> ClassicRenderer:
         return self
@@ -155,6 +153,12 @@ class ClassicRenderer:
         extent = self._model.stat.extent
         near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
         return (near * far / (near + z.astype(np.float64) * (far - near))).astype(np.float32)
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    gl.make_current()
+    context.free()
+    gl.free()
 
 
 def instance_of_geom(model: mujoco.MjModel) -> NDArray[np.int16]:

@@ -1,0 +1,189 @@
+"""A compiled model in which training shots are arranged, dressed and rendered without compiling again.
+
+World frame = ``board``. Every part has a few slots and every distractor one; what a shot does not use is hidden.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cad.parts import Part
+from cad.spatial import BASLER, Array, Intrinsics, quat_wxyz_from_rotation
+from cad.tagboard import TagboardConfig
+from scenes.camera import add_camera, set_camera_pose
+from scenes.distractors import distractor_meshes
+from scenes.gl import mujoco
+from scenes.look import add_board_visuals, add_material, add_mesh, add_texture, add_visual, classic_finish
+from scenes.randomize import LIGHTS, Look, LookRanges, Surface, draw_distractor_surface, draw_part_surface
+from scenes.render import HIDDEN_GROUP, ClassicRenderer, Rendering, What
+from scenes.shots import Placed, Shot
+
+LIGHT_DISTANCE_M = 0.5
+PLAIN_LEVEL = 205.0 / 255.0
+"""Brightness of the pick cell's plain plate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageConfig:
+    """``slots`` instances of each part can be shown at once; windows are up to ``max_size`` pixels wide and high.
+
+    ``shadow_half_m`` is half the side of the square round the shot's focus that shadows are computed for, on a map of
+    ``shadow_size`` pixels.
+    """
+
+    slots: int
+    max_size: int
+    shadow_half_m: float
+    shadow_size: int
+
+
+class Stage:
+    """See the module's text. ``arrange`` a shot, ``dress`` it, then ``render`` it; close it when done."""
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        textures: Sequence[NDArray[np.uint8]],
+        config: StageConfig,
+        board: TagboardConfig | None = None,
+    ) -> None:
+        self._parts = {part.name: part for part in parts}
+        self._textures = len(textures)
+        self._slots = config.slots
+        spec = _build(parts, textures, config, board or TagboardConfig())
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._first_slot = {part.name: k * config.slots for k, part in enumerate(parts)}
+        self._distractors = distractor_meshes().keys()
+        self._shown: list[int] = []
+        self._renderer = ClassicRenderer(self.model, max_width=config.max_size, max_height=config.max_size)
+
+    def arrange(self, shot: Shot) -> NDArray[np.int16]:
+        """Put camera, parts and distractors where the shot says; returns the instance index of each part (N,).
+
+        Parts of one name that outnumber the slots raise IndexError: shots are drawn for the stage they are shown on.
+        """
+        model, data = self.model, self.data
+        for geom in self._shown:
+            model.geom_group[geom] = HIDDEN_GROUP
+        self._shown = []
+        used = dict(self._first_slot)
+        instances = []
+        for placed in shot.parts:
+            instance = used[placed.name]
+            if instance >= self._first_slot[placed.name] + self._slots:
+                raise IndexError(f"a shot shows more than {self._slots} of {placed.name!r}")
+            used[placed.name] += 1
+            instances.append(instance)
+            self._show(f"part_{instance:02d}", placed)
+        for placed in shot.distractors:
+            self._show(placed.name, placed)
+        set_camera_pose(model, shot.T_board_cam)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        return np.array(instances, np.int16)
+
+    def dress(self, shot: Shot, look: Look, ranges: LookRanges, rng: np.random.Generator) -> None:
+        """Set lamps, plate, tags and the surfaces of everything shown."""
+        model = self.model
+        self._light(look, shot.focus_board)
+        board = model.geom("board_visual").id
+        material = model.material("board" if look.texture < 0 else f"plate_{look.texture:02d}").id
+        model.geom_matid[board] = material
+        model.mat_rgba[material, :3] = look.board_rgb
+        model.mat_texrepeat[material] = [look.texture_repeat, look.texture_repeat * 0.6875]
+        model.mat_rgba[model.material("tags").id, :3] = look.tag_level
+        for geom in self._shown:
+            owner = model.geom(geom).name.removesuffix("_visual")
+            if owner.startswith("part_"):
+                part = self._part_of(owner)
+                specular, shininess = classic_finish(part.metallic, part.roughness)
+                nominal = Surface(rgb=part.rgba[:3], specular=specular, shininess=shininess)
+                surface = draw_part_surface(ranges, nominal, part.metallic > 0.5, look.default, rng)
+            else:
+                surface = draw_distractor_surface(ranges, rng)
+            k = model.geom_matid[geom]
+            model.mat_rgba[k, :3] = surface.rgb
+            model.mat_specular[k], model.mat_shininess[k] = surface.specular, surface.shininess
+
+    def render(self, intrinsics: Intrinsics, what: tuple[What, ...]) -> Rendering:
+        """Draw what was arranged through a window."""
+        return self._renderer.render(self.data, intrinsics, what)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._renderer.close()
+
+    def _part_of(self, body: str) -> Part:
+        return list(self._parts.values())[int(body.removeprefix("part_")) // self._slots]
+
+    def _show(self, body: str, placed: Placed) -> None:
+        model = self.model
+        mocap = model.body(body).mocapid[0]
+        self.data.mocap_pos[mocap] = placed.T_board_object[:3, 3]
+        self.data.mocap_quat[mocap] = quat_wxyz_from_rotation(placed.T_board_object[:3, :3])
+        geom = model.geom(f"{body}_visual").id
+        model.geom_group[geom] = 1
+        self._shown.append(geom)
+
+    def _light(self, look: Look, focus: tuple[float, float]) -> None:
+        """Aim the lamps at the focus: shadows are computed round the point a lamp looks at."""
+        model, data = self.model, self.data
+        model.vis.headlight.ambient[:] = look.ambient
+        target = np.array([*focus, 0.0])
+        for i in range(LIGHTS):
+            model.light_active[i] = i < len(look.lamps)
+            if i >= len(look.lamps):
+                continue
+            lamp = look.lamps[i]
+            towards = np.array(lamp.towards) / np.linalg.norm(lamp.towards)
+            model.light_diffuse[i], model.light_specular[i] = lamp.rgb, lamp.specular
+            model.light_castshadow[i] = lamp.shadow
+            data.light_xpos[i], data.light_xdir[i] = target + LIGHT_DISTANCE_M * towards, -towards
+
+
+def _build(
+    parts: Sequence[Part], textures: Sequence[NDArray[np.uint8]], config: StageConfig, board: TagboardConfig
+) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = "stage"
+    spec.stat.extent = 1.0
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 10.0
+    spec.visual.map.shadowclip, spec.visual.quality.shadowsize = config.shadow_half_m, config.shadow_size
+    spec.visual.headlight.diffuse = spec.visual.headlight.specular = [0.0] * 3
+    for i in range(LIGHTS):
+        light = spec.worldbody.add_light(name=f"lamp_{i}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        light.ambient, light.dir = [0.0] * 3, [0.0, 0.0, -1.0]
+    body = spec.worldbody.add_body(name="board")
+    add_board_visuals(spec, body, board)
+    add_camera(body, BASLER, _above())
+    add_material(spec, "surroundings", (0.3, 0.3, 0.31, 1.0), specular=0.0, shininess=0.1)
+    table = spec.worldbody.add_geom(name="surroundings", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.01])
+    table.pos, table.material, table.group = [0.0, 0.0, -board.thickness_m - 0.01], "surroundings", 1
+    table.castshadow = False
+    for k, texture in enumerate(textures):
+        add_texture(spec, f"plate_{k:02d}", texture)
+        add_material(spec, f"plate_{k:02d}", (1, 1, 1, 1), specular=0.05, shininess=0.1, texture=f"plate_{k:02d}")
+    for k, part in enumerate(parts):
+        add_mesh(spec, f"{part.name}_visual", part.mesh)
+        for slot in range(k * config.slots, (k + 1) * config.slots):
+            _add_slot(spec, f"part_{slot:02d}", f"{part.name}_visual")
+    for name, mesh in distractor_meshes().items():
+        add_mesh(spec, name, mesh)
+        _add_slot(spec, name, name)
+    return spec
+
+
+def _add_slot(spec: mujoco.MjSpec, name: str, mesh: str) -> None:
+    """A body that can be put anywhere, with a material of its own, hidden at first."""
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    add_material(spec, name, (0.7, 0.7, 0.7, 1.0), specular=0.5, shininess=0.5)
+    add_visual(body, f"{name}_visual", mesh, material=name).group = HIDDEN_GROUP
+
+
+def _above() -> Array:
+    return np.array([[1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, -1.0, 0.7], [0, 0, 0, 1.0]])
