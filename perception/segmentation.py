@@ -186,15 +186,17 @@ def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = 
         mine = owner == q
         if np.count_nonzero(mine) < config.min_area_px:
             continue
-        blob, origin = _largest_blob(u[mine], v[mine])
-        if np.count_nonzero(blob) < config.min_area_px:
+        inside = _largest_blob(u[mine], v[mine])
+        if np.count_nonzero(inside) < config.min_area_px:
             continue
-        inside = blob[v[mine] - origin[1], u[mine] - origin[0]]
         ui, vi = u[mine][inside], v[mine][inside]
         score = float(heat[rows[q], columns[q]] * mask[vi, ui].mean())
         if score < config.score:
             continue
         classes = probabilities[:, vi // HEAT_STRIDE, ui // HEAT_STRIDE].mean(axis=1)
+        origin = int(ui.min()), int(vi.min())
+        blob = np.zeros((vi.max() - origin[1] + 1, ui.max() - origin[0] + 1), bool)
+        blob[vi - origin[1], ui - origin[0]] = True
         centre = np.median(votes[mine][inside], axis=0).astype(np.float64)
         found.append(
             Detection(
@@ -208,15 +210,13 @@ def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = 
     return sorted(found, key=lambda detection: -detection.score)
 
 
-def _largest_blob(u: NDArray[np.int64], v: NDArray[np.int64]) -> tuple[NDArray[np.bool_], tuple[int, int]]:
-    """The largest connected piece of the pixels (u, v), cut to its bounds, and its first pixel."""
-    image = np.zeros((v.max() - v.min() + 1, u.max() - u.min() + 1), np.uint8)
-    image[v - v.min(), u - u.min()] = 1
+def _largest_blob(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the pixels (u, v) are in their largest connected piece."""
+    u, v = u - u.min(), v - v.min()
+    image = np.zeros((v.max() + 1, u.max() + 1), np.uint8)
+    image[v, u] = 1
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(image)
-    best = 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
-    left, top, width, height = (int(x) for x in statistics[best, : cv2.CC_STAT_AREA])
-    blob = np.asarray(labels)[top : top + height, left : left + width] == best
-    return blob, (int(u.min()) + left, int(v.min()) + top)
+    return np.asarray(labels)[v, u] == 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
 
 
 class Segmenter:

@@ -60,6 +60,16 @@ def test_decoding_the_targets_gives_the_instances_back(seed: int) -> None:
         assert detection.class_probabilities.argmax() == window.classes[k]
 
 
+def test_stray_pixels_do_not_widen_a_mask() -> None:
+    window = draw(np.random.default_rng(0), centres=[(60.0, 60.0)])
+    outputs = perfect_outputs(window)
+    outputs.mask[0, 75:78, 75:78] = 20.0
+    outputs.offset_px[0, :, 37:39, 37:39] = -15.0
+    (detection,) = decode(outputs, 0, DecodeConfig(), reduction=1)
+    assert np.count_nonzero(detection.mask) == np.count_nonzero(window.instances)
+    assert detection.mask.any(axis=0).all() and detection.mask.any(axis=1).all()
+
+
 def test_parts_cut_by_the_border_are_found() -> None:
     window = draw(np.random.default_rng(0), centres=[(-2.0, 60.0), (124.0, 130.0)])
     found = decode(perfect_outputs(window), 0, DecodeConfig(), reduction=1)
