@@ -62,16 +62,16 @@ class Render:
     out: Path = Path("data/crops")
     """Folder of the data set; a run that was stopped is taken up where it was."""
     json: bool = False
-    """Print the manifest as JSON."""
+    """Print where the data set is and its configuration as JSON."""
 
     def run(self) -> None:
         """Generate what is missing of the data set."""
         from scenes.generate import DatasetConfig, generate
 
-        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed)
-        manifest = generate(config, self.out, jobs=self.jobs)
+        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed, jobs=self.jobs)
+        generate(config, self.out, report=lambda line: print(line, file=sys.stderr, flush=True))
         if self.json:
-            print(json.dumps(manifest, indent=1))
+            print(json.dumps({"out": str(self.out)} | dataclasses.asdict(config), default=str, indent=1))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

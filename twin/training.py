@@ -1,0 +1,58 @@
+"""``tagcell train``: render what is missing, then train every network, each for its share of the time."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import get_type_hints
+
+from perception.train import trainer
+from scenes.generate import DatasetConfig, generate
+
+DATASETS: dict[str, DatasetConfig] = {
+    "crops_train": DatasetConfig(kind="crop", split="train", count=20_000, seed=1),
+    "crops_val": DatasetConfig(kind="crop", split="val", count=1_500, seed=2),
+    "windows_train": DatasetConfig(kind="scene", split="train", count=4_000, seed=3, chunk=250),
+    "windows_val": DatasetConfig(kind="scene", split="val", count=200, seed=4, chunk=250),
+}
+"""What the committed weights were trained on; ``tagcell train --seed`` shifts the seeds."""
+
+SHARES: dict[str, tuple[str, float]] = {
+    "segmentation": ("windows", 0.25),
+    "classifier": ("crops", 0.40),
+    "verifier": ("crops", 0.13),
+    "keypoints": ("crops", 0.22),
+}
+"""Network -> (data, share of the training time)."""
+
+
+def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int, jobs: int | None = None) -> list[Path]:
+    """Weights of every network in ``out/weights``; returns their paths.
+
+    Raises SceneError or PerceptionError when a folder holds other data or cannot be written, ValueError for a budget
+    that is not positive. What is there already, data and checkpoints, is kept.
+    """
+    if not minutes > 0:
+        raise ValueError(f"minutes is {minutes}; it must be positive")
+    for name, config in DATASETS.items():
+        generate(_for_run(config, seed, jobs or os.cpu_count() or 1), data / name)
+    written = []
+    for name, (kind, share) in SHARES.items():
+        train = trainer(name)
+        train(
+            get_type_hints(train)["config"](
+                data=data / f"{kind}_train",
+                val=data / f"{kind}_val",
+                out=out / "weights",
+                minutes=minutes * share,
+                threads=threads,
+                seed=seed,
+            )
+        )
+        written.append(out / "weights" / f"{name}.safetensors")
+    return written
+
+
+def _for_run(config: DatasetConfig, seed: int, jobs: int) -> DatasetConfig:
+    return replace(config, seed=config.seed + 1000 * seed, jobs=jobs)
