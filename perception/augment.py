@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from cad.spatial import Array
 
@@ -51,36 +50,70 @@ def rectify_warp(centre: ArrayLike, yaw: float, size: int, scale: float = 1.0) -
     return np.concatenate([A, ((size - 1) / 2 - A @ np.asarray(centre, dtype=np.float64))[:, None]], axis=1)
 
 
-def network_input(images: Tensor, rays: Tensor) -> Tensor:
-    """Input (B, 5, H, W) from images (B, H, W, 3) uint8 and rays (B, 2): each crop normalised by its own mean and
-    standard deviation, and the direction to the crop's centre as two constant channels.
+def network_input(images: NDArray[np.uint8], rays: NDArray[np.floating]) -> Tensor:
+    """Input (B, 5, H, W), channels last in memory, from images (B, H, W, 3) and rays (B, 2).
+
+    Each crop is normalised by its own mean and standard deviation; two constant channels hold the ray to its centre.
     """
-    x = images.permute(0, 3, 1, 2).float()
-    mean, deviation = x.mean((1, 2, 3), keepdim=True), x.std((1, 2, 3), keepdim=True)
-    planes = (5.0 * rays)[:, :, None, None].expand(-1, -1, *x.shape[2:])
-    return torch.cat([(x - mean) / (deviation + 8.0), planes], dim=1).contiguous(memory_format=torch.channels_last)
+    x = np.empty((*images.shape[:3], 5), dtype=np.float32)
+    for i, image in enumerate(images):
+        mean, deviation = _moments(image)
+        gain = 1.0 / (deviation + 8.0)
+        x[i] = _to_planes(image.astype(np.float32), gain * np.eye(3), np.full(3, -gain * mean), rays[i])
+    return torch.from_numpy(x).permute(0, 3, 1, 2)
 
 
-def photometric(x: Tensor, rng: np.random.Generator) -> Tensor:
-    """Network input (B, 5, H, W) with gain, tint, offset, grey, negative, shading, noise and blur varied."""
-    batch, height, width = len(x), x.shape[2], x.shape[3]
+class Photometric:
+    """Network input with gain, tint, offset, grey, negative, shading, noise and blur varied.
 
-    def normal(*shape: int) -> Tensor:
-        return torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+    Noise is read from a table at a random place: drawing it anew would cost more than the network's first stage.
+    """
 
-    def chance(probability: float) -> Tensor:
-        return torch.from_numpy(rng.random((batch, 1, 1, 1)) < probability)
+    def __init__(self, rng: np.random.Generator, noise_values: int = 1 << 20) -> None:
+        self.noise = rng.standard_normal(noise_values, dtype=np.float32)
 
-    c = x[:, :3]
-    c = c * torch.exp(0.15 * normal(batch, 1, 1, 1)) * (1.0 + 0.1 * normal(batch, 3, 1, 1)) + 0.1 * normal(
-        batch, 3, 1, 1
-    )
-    c = torch.where(chance(0.3), c.mean(1, keepdim=True).expand_as(c), c)
-    c = torch.where(chance(0.1), -c, c)
-    ramp_u, ramp_v = torch.linspace(-1, 1, width), torch.linspace(-1, 1, height)[:, None]
-    c = c + 0.15 * (normal(batch, 1, 1, 1) * ramp_u + normal(batch, 1, 1, 1) * ramp_v)
-    if rng.random() < 0.5:
-        c = c + torch.randn_like(c) * float(rng.uniform(0.0, 0.25))
-    if rng.random() < 0.25:
-        c = functional.avg_pool2d(c, 3, 1, 1)
-    return torch.cat([c, x[:, 3:]], dim=1).contiguous(memory_format=torch.channels_last)
+    def __call__(self, images: NDArray[np.uint8], rays: NDArray[np.floating], rng: np.random.Generator) -> Tensor:
+        """Varied input (B, 5, H, W) of images (B, H, W, 3) and rays (B, 2)."""
+        batch, height, width = images.shape[:3]
+        ramps = np.empty((2, height, width, 3), dtype=np.float32)
+        ramps[0] = np.linspace(-1, 1, width)[:, None]
+        ramps[1] = np.linspace(-1, 1, height)[:, None, None]
+        x = np.empty((batch, height, width, 5), dtype=np.float32)
+        for i, image in enumerate(images):
+            mean, deviation = _moments(image)
+            c = image.astype(np.float32)
+            for ramp in ramps:
+                c = cv2.scaleAdd(ramp, float(rng.normal(0.0, 0.15)) * deviation, c)
+            if rng.random() < 0.5:
+                start = int(rng.integers(len(self.noise) - c.size))
+                noise = self.noise[start : start + c.size].reshape(c.shape)
+                c = cv2.scaleAdd(noise, float(rng.uniform(0.0, 0.25)) * deviation, c)
+            if rng.random() < 0.25:
+                c = cv2.blur(c, (3, 3))
+            mix = _colour_mix(rng)
+            gain = 1.0 / (deviation + 8.0)
+            offset = mix @ np.full(3, -gain * mean) + rng.normal(0.0, 0.1, 3)
+            x[i] = _to_planes(np.asarray(c, dtype=np.float32), gain * mix, offset, rays[i])
+        return torch.from_numpy(x).permute(0, 3, 1, 2)
+
+
+def _colour_mix(rng: np.random.Generator) -> Array:
+    """(3, 3) random change of colour: gain and tint, sometimes grey, sometimes negative."""
+    tint = np.diag(np.exp(rng.normal(0.0, 0.15)) * (1.0 + rng.normal(0.0, 0.1, 3)))
+    grey = np.full((3, 3), 1 / 3) if rng.random() < 0.3 else np.eye(3)
+    return (-1.0 if rng.random() < 0.1 else 1.0) * tint @ grey
+
+
+def _moments(image: NDArray[np.uint8]) -> tuple[float, float]:
+    """Mean and standard deviation over all pixels and channels."""
+    mean, deviation = cv2.meanStdDev(image)
+    return float(mean.mean()), float(np.sqrt((deviation**2).mean() + mean.var()))
+
+
+def _to_planes(
+    colour: NDArray[np.float32], mix: Array, offset: Array, ray: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """(H, W, 5) with ``mix @ colour + offset`` and five times the ray."""
+    planes = np.zeros((5, 4))
+    planes[:3, :3], planes[:3, 3], planes[3:, 3] = mix, offset, 5.0 * np.asarray(ray)
+    return cv2.transform(colour, planes)  # pyright: ignore[reportReturnType]

@@ -117,8 +117,7 @@ def classify(model: JointClassifier, images: NDArray[np.uint8], rays: Array, qua
     logs, centres = [], np.zeros((n, 2))
     for k in range(0, 4, 4 // quarter_turns):
         turn = image_turn(k * np.pi / 2)
-        turned = torch.from_numpy(np.ascontiguousarray(np.rot90(images, k, axes=(1, 2))))
-        x = network_input(turned, torch.from_numpy((rays @ turn.T).astype(np.float32)))
+        x = network_input(np.ascontiguousarray(np.rot90(images, k, axes=(1, 2))), rays @ turn.T)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
             logits, centre = model(x)
         log = functional.log_softmax(logits, 1)

@@ -207,7 +207,7 @@ def _part_equivalents(part: Part) -> tuple[tuple[Equivalent, ...], ...]:
 
 
 def _matches(a: TopView, b: TopView, face: int, same: bool) -> list[Equivalent]:
-    """Yaws at which ``b`` looks like ``a``: local minima of a 5-degree sweep, refined to a quarter of a degree."""
+    """Yaws at which ``b`` looks like ``a``: local minima of a 5-degree sweep, refined to half a degree."""
     if abs(a.mask.sum() - b.mask.sum()) * _PIXEL_M**2 * 1e6 > _COARSE_LIMIT_MM2:
         return []
     yaws = np.arange(0.0, 2 * np.pi - 1e-9, _COARSE_STEP)
@@ -215,8 +215,10 @@ def _matches(a: TopView, b: TopView, face: int, same: bool) -> list[Equivalent]:
     minima = (coarse <= np.roll(coarse, 1)) & (coarse < np.roll(coarse, -1)) & (coarse < _COARSE_LIMIT_MM2)
     found: list[Equivalent] = []
     for yaw in yaws[minima]:
-        best, yaw = min((view_difference_mm2(a, b, y), y) for y in yaw + np.radians(np.arange(-4.0, 4.1, 1.0)))
-        best, yaw = min((view_difference_mm2(a, b, y), y) for y in yaw + np.radians(np.arange(-0.75, 0.76, 0.25)))
+        near = yaw + np.radians(np.arange(-4.0, 4.1, 0.5))
+        fine = np.array([view_difference_mm2(a, b, y) for y in near])
+        # strips thinner than two pixels do not count, so a minimum is flat: take its middle
+        best, yaw = float(fine.min()), float(near[fine == fine.min()].mean())
         if best >= SAME_VIEW_MM2 or (same and abs(float(wrap_angle(yaw))) < 2 * _COARSE_STEP):
             continue
         shift = a.centroid - rotation_z(yaw)[:2, :2] @ b.centroid

@@ -108,7 +108,7 @@ class PoseNets:
     def hypotheses(
         self, crops: NDArray[np.uint8], rays: ArrayLike, count: int = PROPOSALS, quarter_turns: int = 4
     ) -> list[CropReading]:
-        """J's readings of crops (N, 128, 128, 3) with the rays (N, 2), x/z and y/z in ``cam``, through their centres."""
+        """J's readings of crops (N, 128, 128, 3) with the rays (N, 2), x/z and y/z in ``cam``, to their centres."""
         images, directions = _checked(crops, rays)
         if not len(images):
             return []

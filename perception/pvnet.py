@@ -121,7 +121,7 @@ def pvnet_loss(
 
 
 def sample_cells(masks: NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``count`` random flat cells (N, count) of each mask (N, 64, 64), with replacement; of all cells if it is empty."""
+    """``count`` random flat cells (N, count) of each mask (N, 64, 64), of any cells where a mask is empty."""
     out = np.empty((len(masks), count), dtype=np.int64)
     for i, mask in enumerate(masks):
         inside = np.flatnonzero(mask)
@@ -136,7 +136,7 @@ def infer_votes(
     ``offset`` (P, K, 2), ``log_scale`` (P, K) and ``mask`` (64, 64) probability. At most ``most_pixels`` vote, evenly
     spread over the mask; where under 16 pixels are likely to be of the part, the 16 likeliest vote.
     """
-    x = network_input(torch.from_numpy(images), torch.from_numpy(rays.astype(np.float32)))
+    x = network_input(images, rays)
     out: list[dict[str, Array]] = []
     with torch.inference_mode():
         with torch.autocast("cpu", torch.bfloat16):

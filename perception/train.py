@@ -21,6 +21,9 @@ FLAT = (tyro.conf.OmitArgPrefixes,)
 
 TRAINERS: dict[str, str] = {
     "segmentation": "perception.train_segmentation:train_segmentation",
+    "classifier": "perception.train_crops:train_classifier",
+    "verifier": "perception.train_crops:train_verifier",
+    "keypoints": "perception.train_crops:train_keypoints",
 }
 """Network name -> "module:function"; the function takes its config as ``config``, which tyro reads."""
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from perception.augment import CROP, crop_warp, network_input, photometric, warp_image
+from perception.augment import CROP, Photometric, crop_warp, warp_image
 from perception.classifier import JointClassifier, SoftLabels, classifier_loss
 from perception.dataset import CropSet, load_crops, manifest_hash
 from perception.faces import FaceTable
@@ -80,8 +80,9 @@ class KeypointsConfig(CropTrainingConfig):
 class CropSource:
     """Draws batches of crops, each turned by a random angle and shifted by a few pixels, with their labels."""
 
-    def __init__(self, crops: CropSet, labels: CropLabels) -> None:
+    def __init__(self, crops: CropSet, labels: CropLabels, seed: int) -> None:
         self.crops, self.labels = crops, labels
+        self.photometric = Photometric(np.random.default_rng(seed))
 
     def draw(
         self, count: int, rng: np.random.Generator, with_masks: bool = False
@@ -99,11 +100,6 @@ class CropSource:
         return images, self.labels.take(rows).warped(warps, angles), masks
 
 
-def to_input(images: NDArray[np.uint8], rays: NDArray[Any], rng: np.random.Generator) -> Tensor:
-    """Augmented network input."""
-    return photometric(network_input(torch.from_numpy(images), torch.from_numpy(rays.astype(np.float32))), rng)
-
-
 def classifier_step(model: JointClassifier, source: CropSource, config: ClassifierConfig) -> Step:
     """One step of J."""
     soft = SoftLabels(config.table)
@@ -111,7 +107,7 @@ def classifier_step(model: JointClassifier, source: CropSource, config: Classifi
     def step(rng: np.random.Generator) -> dict[str, Tensor]:
         images, labels, _ = source.draw(config.batch, rng)
         with torch.autocast("cpu", torch.bfloat16):
-            logits, centres = model(to_input(images, labels.ray, rng))
+            logits, centres = model(source.photometric(images, labels.ray, rng))
         target, inside = torch.from_numpy(soft(labels)), torch.from_numpy(soft.within_part(labels))
         return classifier_loss(logits, centres, target, inside, torch.from_numpy(labels.centre.astype(np.float32)))
 
@@ -127,7 +123,7 @@ def verifier_step(model: Verifier, source: CropSource, config: VerifierConfig) -
         labels = source.labels.take(rows)
         views, rays, target = sampler(source.crops.images[rows], labels, rng)
         with torch.autocast("cpu", torch.bfloat16):
-            logits = model(to_input(views, rays, rng))
+            logits = model(source.photometric(views, rays, rng))
         log = listwise(logits.reshape(config.batch, 2, -1))
         return verifier_loss(log, torch.from_numpy(target), torch.from_numpy(sampler.within_part(labels)))
 
@@ -141,7 +137,7 @@ def keypoints_step(model: PVNet, source: CropSource, config: KeypointsConfig) ->
         images, labels, masks = source.draw(config.batch, rng, with_masks=True)
         return pvnet_loss(
             model,
-            to_input(images, labels.ray, rng),
+            source.photometric(images, labels.ray, rng),
             torch.from_numpy(masks.astype(np.float32)),
             torch.from_numpy(labels.face),
             torch.from_numpy(labels.keypoints.astype(np.float32)),
@@ -185,7 +181,7 @@ def _train(
     some_val, some_labels = take_crops(val, some), val_labels.take(some)
     with seeded(config.seed):
         model = build(table).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    step = make_step(model, CropSource(crops, labels), config)
+    step = make_step(model, CropSource(crops, labels, config.seed), config)
     result = train(name, model, step, config, config.out, validate=lambda m: score(m, some_val, some_labels, table))
     model.load_state_dict(result.state_dict)
     figures = score(model.eval(), val, val_labels, table)

@@ -128,7 +128,7 @@ def score_views(
 
     ``views`` (sum of ``counts``, 96, 96, 3) holds the views of all crops, ``counts`` of each; their rays alike.
     """
-    x = network_input(torch.from_numpy(views), torch.from_numpy(rays.astype(np.float32)))
+    x = network_input(views, rays)
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
         logits = model(x)
     out: list[tuple[Array, float]] = []
