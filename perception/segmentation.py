@@ -129,9 +129,11 @@ class SegmentationNet(nn.Module):
         self.at2 = _convolution(a, 24)
         self.pixel_head = nn.Conv2d(24, 4 + 2, 1)
         self.centre_head = nn.Sequential(_convolution(b, b), nn.Conv2d(b, 1 + n_parts, 1))
+        # Parts are rare: masks and centres start from a small probability.
         final = self.centre_head[1]
-        assert isinstance(final, nn.Conv2d) and final.bias is not None
-        nn.init.constant_(final.bias[:1], -3.0)
+        assert isinstance(final, nn.Conv2d) and final.bias is not None and self.pixel_head.bias is not None
+        nn.init.constant_(final.bias[:1], -4.0)
+        nn.init.constant_(self.pixel_head.bias[:4], -2.0)
 
     def forward(self, images: Tensor) -> Outputs:
         """Outputs for normalised images (B, 3, H, W), H and W whole multiples of 16."""

@@ -39,7 +39,7 @@ from perception.training import (
     train,
     weights_metadata,
 )
-from perception.windows import MIN_VISIBLE_PX, Window, Windows, flip, paste, recolour, warp
+from perception.windows import MIN_VISIBLE_PX, Window, Windows, cut, flip, paste, recolour, warp
 
 NO_CLASS = -100
 HEAT_SIGMA_CELLS = 1.1
@@ -49,8 +49,9 @@ HEAT_SIGMA_CELLS = 1.1
 class SegmentationTraining(TrainingConfig):
     """Where the windows are and how they are varied; the rest as in ``TrainingConfig``.
 
-    ``start`` names a folder with earlier weights to go on from. ``warp`` is the share of windows that are turned and
-    scaled, ``paste`` the mean number of parts of other windows that are tried in free places of one.
+    ``start`` names a folder with earlier weights to go on from. ``size`` is the side of the squares cut from the
+    windows, a multiple of 16, ``warp`` the share of windows that are turned and scaled, ``paste`` the mean number of
+    parts of other windows that are tried in free places of one.
     """
 
     data: Path
@@ -58,7 +59,8 @@ class SegmentationTraining(TrainingConfig):
     out: Path = Path("perception/weights")
     start: Path | None = None
     minutes: float = 16.0
-    batch: int = 8
+    batch: int = 12
+    size: int = 208
     learning_rate: float = 3e-3
     warp: float = 0.4
     paste: float = 2.5
@@ -117,6 +119,7 @@ def example(windows: Windows, rng: np.random.Generator, config: SegmentationTrai
     window = flip(window, rng)
     if rng.random() < config.warp:
         window = warp(window, rng)
+    window = cut(window, config.size, rng)
     return Window(recolour(window.image, rng), window.instances, window.centres, window.classes)
 
 

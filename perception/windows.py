@@ -60,6 +60,22 @@ def flip(window: Window, rng: np.random.Generator) -> Window:
     return Window(np.ascontiguousarray(image), np.ascontiguousarray(instances), centres, window.classes)
 
 
+def cut(window: Window, size: int, rng: np.random.Generator, near: float = 0.7) -> Window:
+    """A square of ``size`` pixels, with probability ``near`` one that holds the centre of a part.
+
+    Parts fill one pixel in a hundred; smaller windows round them show the network more of them a second.
+    """
+    limit = np.array(window.instances.shape[::-1]) - size
+    if np.any(limit < 0):
+        raise ValueError(f"cannot cut {size} pixels from a window of {window.instances.shape}")
+    u, v = rng.integers(0, limit + 1)
+    if len(window.centres) and rng.random() < near:
+        centre = window.centres[rng.integers(len(window.centres))]
+        u, v = np.clip((centre - rng.uniform(0, size, 2)).astype(int), 0, limit)
+    place = np.s_[v : v + size, u : u + size]
+    return Window(window.image[place], window.instances[place], window.centres - [u, v], window.classes)
+
+
 def warp(window: Window, rng: np.random.Generator) -> Window:
     """Turned by any angle, scaled by up to 15 % and shifted; what comes in from outside is one grey."""
     height, width = window.instances.shape
