@@ -1,8 +1,8 @@
 """Convex pieces of a part for contact: CoACD for any mesh, cutting by planes where the shape is known.
 
-CoACD (Wei et al., SIGGRAPH 2022) suits solid parts. On sheet of 0.3 mm it needs 60 to 95 pieces and still stands tens of
-micrometres proud; a part that is made of known convex features is cut along them instead (``cut``), which is exact on
-flat faces. ``excess_m`` says how far pieces stand outside the part, whichever way they were made.
+CoACD (Wei et al., SIGGRAPH 2022) suits solid parts. On sheet of 0.3 mm it needs 60 to 95 pieces and still stands tens
+of micrometres proud; a part made of known convex features is cut along them instead (``cut``), which is exact on flat
+faces. ``excess_m`` says how far pieces stand outside the part, whichever way they were made.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Writes a part's folder: everything in it that needs no physics (``scenes`` adds the stable poses, ``twin`` grasps)."""
+"""Writes a part's folder: all that needs no physics (``scenes`` adds the stable poses, ``twin`` the grasps)."""
 
 from __future__ import annotations
 

@@ -25,17 +25,17 @@ class MeshError(CadError):
     """A mesh that cannot be read or does not bound a solid."""
 
 
-def mesh_from_triangles(vertices_m: ArrayLike, triangles: ArrayLike) -> trimesh.Trimesh:
+def mesh_from_triangles(vertices_m: ArrayLike, triangles: ArrayLike, name: str = "mesh") -> trimesh.Trimesh:
     """A checked mesh of one solid from vertices (V, 3) in metres and triangles (F, 3), equal vertices merged.
 
     Raises MeshError as ``check_mesh`` does.
     """
-    rounded = np.round(np.asarray(vertices_m, dtype=np.float64), _MERGE_DIGITS) + 0.0  # no negative zeros
+    rounded = np.round(np.asarray(vertices_m, dtype=np.float64).reshape(-1, 3), _MERGE_DIGITS) + 0.0  # no -0.0
     vertices, index = np.unique(rounded, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[np.asarray(triangles, dtype=np.int64)]
+    faces = index.reshape(-1)[np.asarray(triangles, dtype=np.int64).reshape(-1, 3)]
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     mesh = trimesh.Trimesh(vertices, faces[distinct], process=False)
-    check_mesh(mesh)
+    check_mesh(mesh, name)
     return mesh
 
 
@@ -73,7 +73,7 @@ def read_source(path: Path, unit: str = "mm") -> trimesh.Trimesh:
     except (ValueError, IndexError, TypeError, NotImplementedError) as error:
         raise MeshError(f"{path} cannot be read as {suffix}: {error}") from error
     assert isinstance(raw, trimesh.Trimesh)
-    return mesh_from_triangles(raw.vertices * METRES_PER_UNIT[unit], raw.faces)
+    return mesh_from_triangles(raw.vertices * METRES_PER_UNIT[unit], raw.faces, str(path))
 
 
 def write_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
@@ -106,7 +106,7 @@ def distance_to_surface(mesh: trimesh.Trimesh, points: Array) -> Array:
 
 def _read_step(path: Path) -> trimesh.Trimesh:
     try:
-        from build123d import import_step
+        from build123d import import_step  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MeshError(f"reading {path} needs a CAD kernel: pip install 'tagcell[cad]'") from error
     try:
@@ -114,4 +114,4 @@ def _read_step(path: Path) -> trimesh.Trimesh:
     except (ValueError, RuntimeError) as error:
         raise MeshError(f"{path} cannot be read as STEP: {error}") from error
     vertices, triangles = shape.tessellate(DEFLECTION_MM, ANGULAR_DEFLECTION_RAD)
-    return mesh_from_triangles([[1e-3 * v.X, 1e-3 * v.Y, 1e-3 * v.Z] for v in vertices], triangles)
+    return mesh_from_triangles([[1e-3 * v.X, 1e-3 * v.Y, 1e-3 * v.Z] for v in vertices], triangles, str(path))

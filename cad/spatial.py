@@ -86,7 +86,7 @@ def rotation_angle(R_a: Array, R_b: Array) -> float:
 
 
 def yaw_of(R: Array) -> float:
-    """The angle in rad about z that best turns the identity into ``R`` (the yaw of a rotation that is nearly about z)."""
+    """The angle in rad about z that best turns the identity into ``R`` (the yaw of a rotation nearly about z)."""
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
 
 

@@ -17,13 +17,14 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from cad.meshes import distance_to_surface, surface_samples
-from cad.spatial import Array, rotation_angle, rotation_from_rotvec, transform
+from cad.spatial import Array, rotation_from_rotvec, transform
 
 RELATIVE_TOLERANCE = 0.01
 """A symmetry may move the surface by this share of the part's diameter."""
 SAME_ROTATION_RAD = np.radians(5.0)
 TURNS = (2, 3, 4, 5, 6, 8)
 _ODD_ANGLES_RAD = (0.41, 1.0, 1.73, 2.6)  # shared by no finite turn: what passes them is continuous
+_GOOD = 0.25  # a rotation found this well, relative to the tolerance, is not looked for again
 _SAMPLES = 600
 _DENSE = 20_000
 _MAX_PAIRS = 4000
@@ -48,7 +49,11 @@ def find_symmetries(mesh: trimesh.Trimesh, tolerance_m: float | None = None) -> 
     axes = [axis for axis in checker.principal_axes if checker.is_continuous(axis)]
     found: list[tuple[float, Array]] = []
     for R in checker.candidates():
-        if _covered(R, axes) or not checker.may_pass(R):
+        if _covered(R, axes):
+            continue
+        if any(d < _GOOD * checker.tolerance_m and _same(R, other, axes) for d, other in found):
+            continue
+        if not checker.may_pass(R):
             continue
         deviation = checker.deviation(R)
         if deviation <= checker.tolerance_m:
@@ -165,12 +170,11 @@ def _signed(axis: Array) -> Array:
 
 def _covered(R: Array, axes: list[Array]) -> bool:
     """True for the identity and for turns about a continuous axis."""
-    if rotation_angle(np.eye(3), R) < SAME_ROTATION_RAD:
-        return True
-    return any(float(axis @ R @ axis) > np.cos(SAME_ROTATION_RAD) for axis in axes)
+    return _same(R, np.eye(3), axes)
 
 
 def _same(a: Array, b: Array, axes: list[Array]) -> bool:
-    if rotation_angle(a, b) < SAME_ROTATION_RAD:
+    """True when two rotations are alike, or differ by a turn about a continuous axis only."""
+    if np.trace(a.T @ b) > 1 + 2 * np.cos(SAME_ROTATION_RAD):
         return True
     return any(float((a @ axis) @ (b @ axis)) > np.cos(SAME_ROTATION_RAD) for axis in axes)

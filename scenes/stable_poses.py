@@ -163,7 +163,7 @@ def drop(part: Part, config: StablePoseConfig) -> Drops:
     end = np.empty_like(start)
     for i in range(0, config.drops, _BATCH):
         states, _ = rollout.rollout(model, workers, start[i : i + _BATCH], nstep=steps)
-        end[i : i + _BATCH] = states[:, -1]
+        end[i : i + _BATCH] = np.asarray(states)[:, -1]
     velocity = end[:, 8:14]
     still = np.linalg.norm(velocity[:, :3], axis=1) < config.still_speed
     still &= np.linalg.norm(velocity[:, 3:], axis=1) < config.still_rate

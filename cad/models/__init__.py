@@ -1,1 +1,1 @@
-"""Scripts that make the parts' solids (extra ``cad``) and fill the part folders. Running the cell does not need them."""
+"""Scripts that make the solids and fill the part folders (extra ``cad``). Running the cell does not need them."""

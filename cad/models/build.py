@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from build123d import Solid, export_step
+from build123d import Solid, export_step  # pyright: ignore[reportMissingImports]
 
 from cad.folders import PartFacts, write_part_folder
 from cad.meshes import ANGULAR_DEFLECTION_RAD, DEFLECTION_MM, mesh_from_triangles

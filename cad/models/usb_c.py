@@ -13,7 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from build123d import Axis, Box, Cylinder, Plane, Pos, Rectangle, SlotOverall, Solid, chamfer, extrude, fillet
+from build123d import (  # pyright: ignore[reportMissingImports]
+    Axis,
+    Box,
+    Cylinder,
+    Plane,
+    Pos,
+    Rectangle,
+    SlotOverall,
+    Solid,
+    chamfer,
+    extrude,
+    fillet,
+)
 
 SPEC = (
     "USB-IF, Universal Serial Bus Type-C Cable and Connector Specification, release 2.x, section 3.2 (receptacle "
@@ -159,7 +171,7 @@ def intersection_volume_mm3(a: Solid, b: Solid) -> float:
 
 
 def contact_ys() -> list[float]:
-    """y of the contacts of one row."""
+    """Where the contacts of one row are across the width, in mm."""
     return [(i - (CONTACTS - 1) / 2) * CONTACT_PITCH for i in range(CONTACTS)]
 
 

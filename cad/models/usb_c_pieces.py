@@ -7,6 +7,8 @@ sagitta of its inner arc only, towards the inside.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import trimesh
 
@@ -36,9 +38,9 @@ def cells(part: str, feature: str) -> list[list[Plane]]:
 
 def pieces(part: str, features: dict[str, list[trimesh.Trimesh]]) -> list[trimesh.Trimesh]:
     """Convex pieces of a part from the meshes of its features, in millimetres like the meshes."""
-    out = []
+    out: list[trimesh.Trimesh] = []
     for feature, meshes in features.items():
-        solids = [trimesh.util.concatenate(meshes)] if feature in ROWS else meshes
+        solids = [_together(meshes)] if feature in ROWS else meshes
         out += [cut(mesh, planes) for mesh in solids for planes in cells(part, feature)]
     return out
 
@@ -46,12 +48,11 @@ def pieces(part: str, features: dict[str, list[trimesh.Trimesh]]) -> list[trimes
 def box(x: Range = _ANY, y: Range = _ANY, z: Range = _ANY) -> list[Plane]:
     """The half-spaces of an axis-aligned box, drawn in by the slack; infinite bounds are left out."""
     planes: list[Plane] = []
-    for axis, (low, high) in enumerate((x, y, z)):
-        unit = np.eye(3)[axis]
+    for (low, high), (a, b, c) in zip((x, y, z), np.eye(3).tolist(), strict=True):
         if np.isfinite(high):
-            planes.append((tuple(unit), high - _SLACK_MM))
+            planes.append(((a, b, c), high - _SLACK_MM))
         if np.isfinite(low):
-            planes.append((tuple(-unit), -(low + _SLACK_MM)))
+            planes.append(((-a, -b, -c), -(low + _SLACK_MM)))
     return planes
 
 
@@ -62,8 +63,13 @@ def sector(axis: int, centre: tuple[float, float], start: float, stop: float) ->
     for angle, sign in ((start, -1.0), (stop, 1.0)):
         n = np.zeros(3)
         n[first], n[second] = -sign * np.sin(angle), sign * np.cos(angle)
-        planes.append((tuple(n), float(n[first] * centre[0] + n[second] * centre[1])))
+        planes.append(((float(n[0]), float(n[1]), float(n[2])), float(n[first] * centre[0] + n[second] * centre[1])))
     return planes
+
+
+def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    vertices, faces = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def _tube_cells() -> list[list[Plane]]:
@@ -78,7 +84,7 @@ def _tube_cells() -> list[list[Plane]]:
     out += [box(y=y, z=above) for y in ((outer, corner), (-corner, -outer))]
     edges = np.linspace(-np.pi / 2, np.pi / 2, ARC_SECTORS + 1)
     for side, middle in ((corner, 0.0), (-corner, np.pi)):
-        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        for start, stop in pairwise(edges):
             lower = (start + stop) / 2 < 0 if side > 0 else (start + stop) / 2 > 0
             half = box(z=(-np.inf, 0.0) if lower else above)
             out.append(sector(0, (side, 0.0), start + middle, stop + middle) + half)

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+import trimesh
+
+from cad.meshes import (
+    MeshError,
+    check_mesh,
+    distance_to_surface,
+    mesh_from_triangles,
+    read_source,
+    surface_samples,
+    write_mesh,
+)
+from cad.parts import hash_file
+
+
+def box(size=(8e-3, 6e-3, 3e-3)):
+    return trimesh.creation.box(size)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1e-3), ("in", 25.4e-3)])
+@pytest.mark.parametrize("suffix", ["stl", "ply", "obj"])
+def test_a_source_is_read_in_metres_whatever_its_unit(tmp_path, unit, factor, suffix):
+    path = tmp_path / f"part.{suffix}"
+    trimesh.creation.box((8, 6, 3)).export(path)
+    mesh = read_source(path, unit)
+    np.testing.assert_allclose(mesh.extents, np.array([8, 6, 3]) * factor, rtol=1e-6)
+    assert mesh.is_watertight
+    assert len(mesh.vertices) == 8
+
+
+def test_unknown_units_suffixes_and_files_are_named(tmp_path):
+    with pytest.raises(MeshError, match=r"'mile'.*mm"):
+        read_source(tmp_path / "part.stl", "mile")
+    with pytest.raises(MeshError, match="no file"):
+        read_source(tmp_path / "part.stl")
+    (tmp_path / "part.xyz").write_text("1 2 3")
+    with pytest.raises(MeshError, match=r"\.xyz.*\.stl"):
+        read_source(tmp_path / "part.xyz")
+    (tmp_path / "part.stl").write_text("not a mesh")
+    with pytest.raises(MeshError, match=r"part\.stl"):
+        read_source(tmp_path / "part.stl")
+
+
+def test_meshes_that_bound_no_solid_are_refused():
+    mesh = box()
+    with pytest.raises(MeshError, match="watertight"):
+        check_mesh(trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False))
+    with pytest.raises(MeshError, match="normals outwards"):
+        check_mesh(trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False))
+    twisted = mesh.faces.copy()
+    twisted[0] = twisted[0, ::-1]
+    with pytest.raises(MeshError, match="wound both ways"):
+        check_mesh(trimesh.Trimesh(mesh.vertices, twisted, process=False))
+    with pytest.raises(MeshError, match="no triangles"):
+        mesh_from_triangles(np.zeros((0, 3)), np.zeros((0, 3), int))
+
+
+def test_equal_vertices_of_separate_faces_are_merged():
+    soup = box().triangles.reshape(-1, 3)
+    mesh = mesh_from_triangles(soup, np.arange(len(soup)).reshape(-1, 3))
+    assert len(mesh.vertices) == 8
+    assert mesh.volume == pytest.approx(8e-3 * 6e-3 * 3e-3)
+
+
+def test_a_written_mesh_reads_back_and_is_the_same_file_every_time(tmp_path):
+    mesh = trimesh.creation.icosphere(radius=4e-3)
+    write_mesh(mesh, tmp_path / "a.ply")
+    write_mesh(mesh.copy(), tmp_path / "b" / "c.ply")
+    assert hash_file(tmp_path / "a.ply") == hash_file(tmp_path / "b" / "c.ply")
+    again = read_source(tmp_path / "a.ply", "m")
+    assert again.volume == pytest.approx(mesh.volume, rel=1e-6)
+
+
+def test_surface_samples_lie_on_the_surface_with_its_normals_and_repeat_with_the_seed():
+    mesh = box()
+    points, normals = surface_samples(mesh, 500, np.random.default_rng(3))
+    half = mesh.extents / 2
+    on_face = np.abs(np.abs(points) - half) < 1e-12
+    assert on_face.any(axis=1).all()
+    np.testing.assert_allclose((normals * points).sum(axis=1), (np.abs(normals) * half).sum(axis=1))
+    np.testing.assert_array_equal(points, surface_samples(mesh, 500, np.random.default_rng(3))[0])
+    share = (np.abs(normals[:, 2]) > 0.5).mean()
+    assert share == pytest.approx(2 * 48 / mesh.area * 1e-6, abs=0.07)
+
+
+def test_distances_are_exact_at_the_size_of_the_parts():
+    mesh = box()
+    points = np.array([[0, 0, 1.53e-3], [0, 0, 0], [5e-3, 4e-3, 0], [1e-3, 3e-3, 1.5e-3]])
+    np.testing.assert_allclose(distance_to_surface(mesh, points), [3e-5, 1.5e-3, np.sqrt(2e-6), 0], atol=1e-9)
+    assert distance_to_surface(mesh, np.empty((0, 3))).shape == (0,)
