@@ -27,6 +27,7 @@ _ODD_ANGLES_RAD = (0.41, 1.0, 1.73, 2.6)  # shared by no finite turn: what passe
 _GOOD = 0.25  # a rotation found this well, relative to the tolerance, is not looked for again
 _SAMPLES = 600
 _DENSE = 20_000
+_DOUBTFUL = 20  # points whose distance from the dense samples is largest, measured exactly
 _MAX_PAIRS = 4000
 
 
@@ -115,7 +116,7 @@ class _Checker:
         """Largest distance in metres from the surface of the sample points turned by ``R``."""
         turned = self.samples @ R.T
         near = self._tree.query(turned)[0]
-        doubtful = turned[np.argsort(-near)[:100]]
+        doubtful = turned[np.argsort(-near)[:_DOUBTFUL]]
         return float(distance_to_surface(self.mesh, doubtful).max())
 
     def may_pass(self, R: Array) -> bool:
