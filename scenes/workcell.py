@@ -17,6 +17,7 @@ from scenes.cell_config import CellConfig, TrayConfig
 from scenes.contacts import BOX, PART, Touches, add_primitive, make_collision, set_options
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_part_material, add_visual, classic_finish
+from scenes.randomize import DEFAULT_AMBIENT, DEFAULT_LAMPS
 
 __all__ = ["CellConfig", "TrayConfig", "build_arm", "build_board_scene", "build_workcell", "part_body", "set_parts"]
 
@@ -24,7 +25,8 @@ OVERVIEW = "overview"
 """Camera that sees the whole cell from the side."""
 OVERVIEW_INTRINSICS = Intrinsics(width=1600, height=1200, fx=1500.0, fy=1500.0, cx=799.5, cy=599.5)
 SHADOW_SIZE = 4096
-"""Pixels of the shadow map: with a spot of 14 degrees shadows are clean at the camera's resolution."""
+SHADOW_HALF_M = 0.22
+"""The shadow map covers this far from the board's centre: 0.11 mm a texel, finer than two camera pixels."""
 
 
 def build_workcell(config: CellConfig, part_names: Sequence[str]) -> mujoco.MjSpec:
@@ -84,8 +86,8 @@ def set_visuals(spec: mujoco.MjSpec) -> None:
     """Clipping planes in metres and the quality of shadows."""
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.02, 10.0
-    spec.visual.quality.shadowsize = SHADOW_SIZE
-    spec.visual.headlight.ambient = [0.32] * 3
+    spec.visual.quality.shadowsize, spec.visual.map.shadowclip = SHADOW_SIZE, SHADOW_HALF_M
+    spec.visual.headlight.ambient = [DEFAULT_AMBIENT] * 3
     spec.visual.headlight.diffuse = [0.0] * 3
     spec.visual.headlight.specular = [0.0] * 3
 
@@ -117,39 +119,28 @@ def _add_board(spec: mujoco.MjSpec, config: CellConfig) -> mujoco.MjsBody:
 
 
 def _add_lights(board: mujoco.MjsBody) -> None:
-    """A lamp on each side; the brighter one casts shadows. Narrow cones keep the shadow map sharp."""
-    for name, x, y, brightness, shadow in (("lamp_0", 0.45, 0.40, 0.42, True), ("lamp_1", -0.50, -0.25, 0.26, False)):
-        position = np.array([x, y, 1.1])
+    """The cell's two lamps; shadows are computed round the board's centre."""
+    for i, lamp in enumerate(DEFAULT_LAMPS):
+        towards = np.array(lamp.towards) / np.linalg.norm(lamp.towards)
         board.add_light(
-            name=name,
-            type=mujoco.mjtLightType.mjLIGHT_SPOT,
-            pos=position,
-            dir=-position / np.linalg.norm(position),
-            cutoff=14.0,
-            exponent=0.0,
-            diffuse=[brightness] * 3,
-            specular=[0.5 * brightness / 0.42] * 3,
+            name=f"lamp_{i}",
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=towards,
+            dir=-towards,
+            diffuse=lamp.rgb,
+            specular=[lamp.specular] * 3,
             ambient=[0.0] * 3,
-            castshadow=shadow,
+            castshadow=lamp.shadow,
         )
 
 
 def _add_overview(spec: mujoco.MjSpec) -> None:
-    """A camera and a soft light for pictures of the whole cell."""
+    """A camera for pictures of the whole cell."""
     eye, target = np.array([1.45, 1.15, 0.95]), np.array([0.30, 0.05, 0.28])
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(z, [0.0, 0.0, 1.0]))
     T_world_cam = transform(np.stack([x, np.cross(z, x), z], axis=1), eye)
     add_camera(spec.worldbody, OVERVIEW_INTRINSICS, T_world_cam, OVERVIEW)
-    spec.worldbody.add_light(
-        name="fill",
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        dir=-eye / np.linalg.norm(eye),
-        diffuse=[0.15] * 3,
-        specular=[0.1] * 3,
-        ambient=[0.0] * 3,
-        castshadow=False,
-    )
 
 
 def _add_hull(spec: mujoco.MjSpec, name: str, hull: trimesh.Trimesh) -> None:
