@@ -231,8 +231,10 @@ class PickController:
         except RobotError as error:
             self._finish(replace(attempt, outcome="collision", note=str(error)))
             raise
-        self._actions.park()
-        self._finish(attempt)
+        try:
+            self._actions.park()
+        finally:
+            self._finish(attempt)
 
     def _finish(self, attempt: Attempt) -> None:
         attempt = replace(attempt, end_s=self._robot.observe().time_s)

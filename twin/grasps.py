@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from cad import gripper
-from cad.parts import Part, StablePose
+from cad.parts import Part, StablePose, hash_file
 from cad.spatial import Array, inverse, transform
 from twin.grasp_geometry import (
     ContactRules,
@@ -208,7 +208,7 @@ def write_grasps(part: Part, config: GraspConfig | None = None) -> Path:
     searches = [find_grasps(part, pose, config) for pose in part.stable_poses]
     failed = {i: s.rejections for i, s in enumerate(searches) if not s.grasps}
     path = part.folder / "grasps.json"
-    content = {"mesh_hash": part.mesh_hash, "grasps": [g.as_json() for s in searches for g in s.grasps]}
+    content = {"made_for": _made_for(part), "grasps": [g.as_json() for s in searches for g in s.grasps]}
     path.write_text(json.dumps(content) + "\n")
     read_grasps.cache_clear()
     if failed:
@@ -216,19 +216,24 @@ def write_grasps(part: Part, config: GraspConfig | None = None) -> Path:
     return path
 
 
+def _made_for(part: Part) -> dict[str, str]:
+    """Hashes of what grasps depend on."""
+    return {"mesh": part.mesh_hash, "stable_poses": hash_file(part.folder / "stable_poses.json")}
+
+
 @lru_cache(maxsize=64)
 def read_grasps(part: Part) -> tuple[tuple[Grasp, ...], ...]:
     """Grasps of ``part`` by stable pose, best first, from its folder.
 
-    Raises GraspError when there are none or they were made for another mesh.
+    Raises GraspError when there are none or they were made for another mesh or other stable poses.
     """
     path = part.folder / "grasps.json"
     if not path.exists():
         raise GraspError(f"part {part.name!r} has no grasps.json in {part.folder}; write_grasps makes it")
-    made_for = json.loads(path.read_text()).get("mesh_hash")
-    if made_for != part.mesh_hash:
+    made_for = json.loads(path.read_text()).get("made_for")
+    if made_for != _made_for(part):
         raise GraspError(
-            f"{path} was made for mesh {made_for}, the mesh is {part.mesh_hash}; write_grasps makes it anew"
+            f"{path} was made for {made_for}, the part's files are {_made_for(part)}; write_grasps makes it anew"
         )
     by_pose: list[list[Grasp]] = [[] for _ in part.stable_poses]
     for entry in part.grasps:

@@ -1,11 +1,9 @@
-import json
-
 import numpy as np
 import pytest
 import trimesh
 
 from cad import gripper
-from cad.parts import StablePose, hash_file, load_part, planar
+from cad.parts import StablePose, load_part, planar
 from cad.spatial import apply, inverse, rotation_x, rotation_z, transform
 from twin.grasp_geometry import (
     ContactRules,
@@ -26,31 +24,9 @@ SIZE = np.array([8e-3, 6e-3, 3e-3])
 STRIP = PadStrip(half_width_m=3e-3, z_low_m=0.15e-3, z_high_m=10e-3)
 
 
-def make_part(folder, mesh, name="brick", poses=None):
-    """A part folder of ``mesh`` standing on its lowest face, read back."""
-    (folder / name).mkdir()
-    mesh.export(folder / name / "mesh.ply")
-    height = -float(mesh.bounds[0, 2])
-    poses = poses or [{"R_table_part": np.eye(3).tolist(), "t_table_part_m": [0, 0, height], "probability": 1.0}]
-    info = {
-        "name": name,
-        "obj_id": 9,
-        "mass_kg": 3e-4,
-        "material": "steel",
-        "rgba": [1, 1, 1, 1],
-        "metallic": 1.0,
-        "roughness": 0.5,
-        "mesh_hash": hash_file(folder / name / "mesh.ply"),
-    }
-    (folder / name / "part.json").write_text(json.dumps(info))
-    (folder / name / "keypoints.json").write_text(json.dumps({"keypoints_m": np.zeros((8, 3)).tolist()}))
-    (folder / name / "stable_poses.json").write_text(json.dumps({"stable_poses": poses}))
-    return load_part(name, folder)
-
-
 @pytest.fixture
-def brick(tmp_path):
-    return make_part(tmp_path, trimesh.creation.box(SIZE))
+def brick(make_part):
+    return make_part(trimesh.creation.box(SIZE))
 
 
 def contact_of(mesh, yaw, b=0.0, rules=None):
@@ -127,15 +103,15 @@ def test_grasps_of_a_brick_close_on_its_faces(brick):
     assert [g.quality for g in grasps] == sorted((g.quality for g in grasps), reverse=True)
 
 
-def test_flat_faces_rank_above_round_ones(tmp_path):
+def test_flat_faces_rank_above_round_ones(make_part):
     rod = trimesh.creation.cylinder(radius=2e-3, height=6e-3, sections=96)
     rod.apply_transform(transform(rotation_x(np.pi / 2)))
-    part = make_part(tmp_path, rod, "rod")
+    part = make_part(rod, "rod")
     assert find_grasps(part, part.stable_poses[0]).grasps[0].contact.flatness_m < 1e-6
 
 
-def test_too_wide_says_so(tmp_path):
-    part = make_part(tmp_path, trimesh.creation.box([50e-3, 46e-3, 2e-3]), "slab")
+def test_too_wide_says_so(make_part):
+    part = make_part(trimesh.creation.box([50e-3, 46e-3, 2e-3]), "slab")
     coarse = GraspConfig(sample_spacing_m=0.3e-3, yaw_step=np.pi / 6)
     assert "wider than the gripper opens" in find_grasps(part, part.stable_poses[0], coarse).rejections
     with pytest.raises(GraspError, match=r"slab.*wider than the gripper opens"):
@@ -245,15 +221,15 @@ def test_the_wrist_turns_at_most_a_quarter_from_zero(brick):
         assert abs(choice.q_place[5] - choice.q_pick[5]) <= np.pi
 
 
-def test_stable_poses_have_their_own_grasps(tmp_path):
+def test_stable_poses_have_their_own_grasps(make_part):
     lying, standing = np.eye(3), rotation_x(np.pi / 2)
     poses = [
         {"R_table_part": lying.tolist(), "t_table_part_m": [0, 0, 1.5e-3], "probability": 0.6},
         {"R_table_part": standing.tolist(), "t_table_part_m": [0, 0, 3e-3], "probability": 0.4},
     ]
-    part = make_part(tmp_path, trimesh.creation.box(SIZE), poses=poses)
+    part = make_part(trimesh.creation.box(SIZE), poses=poses)
     write_grasps(part)
-    by_pose = read_grasps(load_part("brick", tmp_path))
+    by_pose = read_grasps(load_part("brick", part.folder.parent))
     assert all(isinstance(p, StablePose) for p in part.stable_poses)
     assert by_pose[1][0].width_m == pytest.approx(3e-3, abs=1e-6)
     assert all(g.stable_pose == k for k, grasps in enumerate(by_pose) for g in grasps)

@@ -1,0 +1,328 @@
+"""The controller against a robot of plain arithmetic: parts are boxes that the hand takes along or misses."""
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from cad.parts import planar
+from cad.spatial import BASLER, Array, apply, inverse, rotation_angle, rotation_x, rotation_z, transform
+from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionError
+from scenes.workcell import CellConfig, build_arm
+from twin.attempts import OUTCOMES, AttemptFinished, AttemptStarted, Calibration, ControllerConfig, Looked
+from twin.controller import ControllerError, PickController
+from twin.grasps import GraspError, write_grasps
+from twin.ik import ArmIk
+from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
+
+CELL = CellConfig()
+BOARD = CELL.T_world_board
+NESTS = CELL.nest_frames("main")[:4]
+IK = ArmIk(build_arm(CELL).compile(), np.array(CELL.home_q))
+
+
+@dataclass
+class FakePart:
+    part: object
+    T_base_part: Array
+
+    def lowest(self):
+        return apply(self.T_base_part, self.part.mesh.vertices)[:, 2].min()
+
+
+class FakeRobot:
+    """Moves at once; a part between the closing pads is centred across them and follows the tool until they open."""
+
+    def __init__(self, parts):
+        self.parts, self.held, self.time_s = parts, None, 0.0
+        self.q, self.opening, self.grip_state = np.array(CELL.home_q), 0.02, GripState.AT_POSITION
+        self.misses, self.drop_on_carry, self.stuck, self.refuse = 0, 0, False, False
+        self.carry_heights, self.moves = [], []
+
+    @property
+    def T_base_tcp(self):
+        return IK.forward(self.q)
+
+    def observe(self):
+        return RobotState(
+            time_s=self.time_s,
+            q=self.q,
+            qd=np.zeros(6),
+            T_base_tcp=self.T_base_tcp,
+            opening_m=self.opening,
+            grip=self.grip_state,
+        )
+
+    def move_j(self, q, *, speed, acceleration):
+        if self.held and self.drop_on_carry:
+            self.drop_on_carry -= 1
+            self.held, self.opening, self.grip_state = None, 0.0, GripState.AT_POSITION
+        if self.held:
+            self.carry_heights.append(self.held.lowest() - BOARD[2, 3])
+        self._go(q)
+        return JointMove(q=q, speed=speed, acceleration=acceleration, duration_s=1.0)
+
+    def move_l(self, T_base_tcp, *, speed, acceleration):
+        if self.refuse:
+            raise MotionRefused("refused for the test")
+        if self.stuck:
+            raise RobotError("protective stop")
+        self._go(IK.solve(T_base_tcp, self.q))
+        return LinearMove(T_base_tcp=T_base_tcp, speed=speed, acceleration=acceleration, duration_s=1.0)
+
+    def _go(self, q):
+        before = self.T_base_tcp
+        self.q, self.time_s = np.array(q), self.time_s + 1.0
+        if self.held:
+            self.held.T_base_part = self.T_base_tcp @ inverse(before) @ self.held.T_base_part
+        self.moves.append(self.T_base_tcp)
+        assert self.T_base_tcp[2, 3] > BOARD[2, 3]
+
+    def grip(self, opening_m, *, force_n, speed):
+        self.time_s += 0.3
+        if self.held and opening_m > self.opening:
+            T = self.held.T_base_part
+            floor = BOARD[2, 3] if T[1, 3] < 0.15 else CELL.T_world_tray[2, 3]
+            assert self.held.lowest() - floor < 0.3e-3, "let go too high"
+            T[2, 3] += floor - self.held.lowest()
+            self.held = None
+        target, self.grip_state = opening_m, GripState.AT_POSITION
+        if opening_m < self.opening and (found := self._between()):
+            part, across = found
+            if self.misses:
+                self.misses -= 1
+            elif np.ptp(across) > opening_m:
+                centred = transform(t=-self.T_base_tcp[:3, 0] * (across.min() + across.max()) / 2)
+                part.T_base_part = centred @ part.T_base_part
+                self.held, target, self.grip_state = part, np.ptp(across), GripState.CONTACT_CLOSING
+        self.opening = target
+        return self.observe()
+
+    def _between(self):
+        for part in self.parts:
+            p = apply(inverse(self.T_base_tcp) @ part.T_base_part, part.part.mesh.vertices)
+            if np.abs(p[:, 0]).max() < self.opening / 2 and abs(p[:, 1].mean()) < 3e-3 and p[:, 2].min() < 0:
+                return part, p[:, 0]
+        return None
+
+    def stop(self):
+        pass
+
+
+class FakeCamera:
+    def __init__(self, robot):
+        self.robot = robot
+
+    def capture(self):
+        self.robot.time_s += 1.0
+        return Frame(image=np.zeros((1, 1, 3), np.uint8), intrinsics=BASLER, time_s=self.robot.time_s)
+
+
+class FakeEstimator:
+    """The truth of the parts on the board, as seen by a camera; ``change`` alters or drops an estimate."""
+
+    T_cam_board = inverse(transform(rotation_x(np.pi - 0.01), [0.002, -0.003, 0.70]) @ transform(rotation_z(0.03)))
+
+    def __init__(self, parts, change=None):
+        self.parts, self.change, self.failures = parts, change or (lambda estimate: estimate), 0
+
+    def estimate(self, frame):
+        if self.failures:
+            self.failures -= 1
+            raise PerceptionError("too dark")
+        T_cam_base = self.T_cam_board @ inverse(BOARD)
+        seen = [
+            self.change(PartEstimate(part=p.part.name, T_cam_part=T_cam_base @ p.T_base_part, stable_pose=0, score=0.9))
+            for p in self.parts
+            if p.T_base_part[1, 3] < 0.15
+        ]
+        return FrameEstimate(
+            T_cam_board=self.T_cam_board, parts=tuple(s for s in seen if s), tags_seen=20, tag_rms_px=0.1
+        )
+
+
+PLACES = ((0.03, 0.01, 0.4), (-0.04, -0.02, 2.0), (0.0, 0.03, -1.0))
+
+
+class World:
+    """A robot, a camera and an estimator around boxes lying at ``places`` on the board."""
+
+    def __init__(self, part, places=PLACES, change=None, **config):
+        resting = part.stable_poses[0].T_table_part
+        self.part, self.events = part, []
+        self.parts = [FakePart(part, BOARD @ planar(*place) @ resting) for place in places]
+        self.robot = FakeRobot(self.parts)
+        self.estimator = FakeEstimator(self.parts, change)
+        self.controller = PickController(
+            self.robot,
+            FakeCamera(self.robot),
+            self.estimator,
+            ik=IK,
+            parts={"brick": part},
+            calibration=Calibration(
+                T_base_board=BOARD,
+                T_base_nests={"brick": NESTS},
+                q_park=np.array(CELL.home_q),
+                board_half_m=(0.08, 0.05),
+            ),
+            config=ControllerConfig(**config),
+            on_event=self.events.append,
+        )
+
+    def run(self):
+        return self.controller.run()
+
+    def in_nests(self):
+        """For each nest the parts that lie right in it."""
+        target = NESTS @ self.part.stable_poses[0].T_table_part
+        return [[p for p in self.parts if np.allclose(p.T_base_part, T, atol=1e-5)] for T in target]
+
+
+@pytest.fixture
+def brick(make_part):
+    part = make_part(trimesh.creation.box([8e-3, 6e-3, 3e-3]))
+    write_grasps(part)
+    return part
+
+
+def test_every_part_ends_in_a_nest_of_its_own(brick):
+    world = World(brick)
+    attempts = world.run()
+    assert [a.outcome for a in attempts] == ["placed"] * 3
+    assert [len(n) for n in world.in_nests()] == [1, 1, 1, 0]
+    assert sorted(a.nest for a in attempts) == [0, 1, 2]
+    assert min(world.robot.carry_heights) > 0.06
+    np.testing.assert_allclose(world.robot.q, CELL.home_q)
+
+
+def test_an_error_across_the_pads_is_squeezed_out(brick):
+    def off_across(estimate):  # the best grasp closes along the part's y
+        return replace(estimate, T_cam_part=estimate.T_cam_part @ transform(t=[0.0, 0.8e-3, 0.0]))
+
+    world = World(brick, change=off_across)
+    assert [a.outcome for a in world.run()] == ["placed"] * 3
+    assert [len(n) for n in world.in_nests()] == [1, 1, 1, 0]
+
+
+def test_height_and_tilt_come_from_the_board_not_from_the_estimate(brick):
+    def off_plane(estimate):
+        wrong = transform(rotation_x(0.05), [0.0, 0.0, 0.8e-3])
+        return replace(estimate, T_cam_part=estimate.T_cam_part @ wrong)
+
+    world = World(brick, change=off_plane)
+    for attempt in world.run():
+        assert attempt.outcome == "placed"
+        lying = inverse(BOARD) @ attempt.T_base_part
+        np.testing.assert_allclose(lying[2], brick.stable_poses[0].T_table_part[2], atol=1e-12)
+
+
+def test_an_estimate_far_off_the_plane_is_a_pose_failure(brick):
+    world = World(
+        brick, PLACES[:1], lambda e: replace(e, T_cam_part=e.T_cam_part @ transform(rotation_x(0.5), [0, 0, 0]))
+    )
+    attempts = world.run()
+    assert [(a.outcome, a.tried) for a in attempts] == [("pose", False)]
+    assert "stable pose" in attempts[0].note
+
+
+def test_a_missed_grip_is_tried_again_after_another_look(brick):
+    world = World(brick, PLACES[:1])
+    world.robot.misses = 2
+    attempts = world.run()
+    assert [(a.outcome, a.number) for a in attempts] == [("grasp", 1), ("grasp", 2), ("placed", 3)]
+    looks = [e for e in world.events if isinstance(e, Looked)]
+    assert len(looks) >= 4
+
+
+def test_after_the_last_try_a_part_is_left(brick):
+    world = World(brick, PLACES[:2], tries_per_region=2)
+    world.robot.misses = 100
+    attempts = world.run()
+    assert [a.outcome for a in attempts if a.tried] == ["grasp"] * 4
+    left = [a for a in attempts if not a.tried]
+    assert len(left) == 2 and all(a.outcome == "grasp" and "gave up" in a.note for a in left)
+
+
+def test_a_part_lost_on_the_way_is_a_transport_failure(brick):
+    world = World(brick, PLACES[:1])
+    world.robot.drop_on_carry = 1
+    world.parts[0].T_base_part[0, 3] += 0.0
+    attempts = world.run()
+    assert attempts[0].outcome == "transport"
+    assert not any(world.in_nests()[0])
+
+
+def test_what_is_declined_is_not_touched(brick):
+    world = World(brick, change=lambda e: replace(e, verdict="too blurred"))
+    attempts = world.run()
+    assert [(a.outcome, a.note, a.tried) for a in attempts] == [("declined", "too blurred", False)] * 3
+    assert all(T[2, 3] > 0.06 for T in world.robot.moves)
+
+
+def test_full_trays_are_said(brick):
+    world = World(brick, places=[(x, y, 0.0) for x in (-0.05, 0.0, 0.05) for y in (-0.02, 0.02)])
+    attempts = world.run()
+    assert [a.outcome for a in attempts] == ["placed"] * 4 + ["place"] * 2
+    assert "4 nests" in attempts[-1].note
+
+
+def test_a_frame_that_cannot_be_used_is_taken_again(brick):
+    world = World(brick, PLACES[:1], idle_looks=2)
+    world.estimator.failures = 1
+    assert [a.outcome for a in world.run()] == ["placed"]
+    blind = World(brick, PLACES[:1], idle_looks=2)
+    blind.estimator.failures = 100
+    assert blind.run() == []
+
+
+def test_a_refused_motion_ends_the_attempt_and_a_stopped_robot_the_run(brick):
+    world = World(brick, PLACES[:1], tries_per_region=1)
+    world.robot.refuse = True
+    with pytest.raises(MotionRefused):
+        world.run()  # not even the way back is allowed
+    assert [a.outcome for a in world.controller.attempts] == ["ik"]
+    stopped = World(brick, PLACES[:1])
+    stopped.robot.stuck = True
+    with pytest.raises(RobotError, match="protective stop"):
+        stopped.run()
+    assert stopped.controller.attempts[-1].outcome == "collision"
+
+
+def test_events_tell_the_story_in_order(brick):
+    world = World(brick, PLACES[:1])
+    attempts = world.run()
+    kinds = [type(e) for e in world.events]
+    assert kinds[:3] == [Looked, AttemptStarted, AttemptFinished] and set(kinds[3:]) == {Looked}
+    started, finished = world.events[1].attempt, world.events[2].attempt
+    assert finished is attempts[0] and started.outcome is None
+    assert started.look_time_s <= started.start_s < finished.end_s
+    assert finished.opening_m == pytest.approx(finished.grasp.width_m, abs=1e-4)
+    np.testing.assert_allclose(finished.T_base_tcp[:3, 2], [0, 0, -1], atol=1e-9)
+    assert set(a.outcome for a in attempts) <= set(OUTCOMES)
+
+
+def test_the_nearest_turn_of_the_hand_keeps_the_wrist_inside(brick):
+    for yaw in np.linspace(-3, 3, 7):
+        world = World(brick, [(0.0, 0.0, yaw)])
+        assert world.run()[0].outcome == "placed"
+        nest = NESTS[0] @ brick.stable_poses[0].T_table_part
+        assert rotation_angle(world.parts[0].T_base_part[:3, :3], nest[:3, :3]) < 1e-6
+
+
+def test_what_is_missing_is_named_before_anything_moves(brick):
+    calibration = Calibration(T_base_board=BOARD, T_base_nests={}, q_park=np.zeros(6), board_half_m=(0.1, 0.1))
+    robot = FakeRobot([])
+    with pytest.raises(ControllerError, match="brick"):
+        PickController(
+            robot, FakeCamera(robot), FakeEstimator([]), ik=IK, parts={"brick": brick}, calibration=calibration
+        )
+    path = brick.folder / "grasps.json"
+    path.write_text(json.dumps({"made_for": "old", "grasps": []}))
+    with pytest.raises(GraspError, match="old"):
+        World(replace(brick))
+    with pytest.raises(ValueError, match=r"grip_force_n 500"):
+        ControllerConfig(grip_force_n=500)
+    with pytest.raises(ValueError, match=r"joint_speed 9"):
+        ControllerConfig(joint_speed=9.0)
