@@ -1,9 +1,10 @@
 """Sub-pixel refinement of a part's place on the table from its contour: x, y and yaw with the resting face known.
 
-The CAD's visible edges are laid over the image. A coarse grid over contrast-normalised gradients finds the basin (thin
-walls give parallel edges, and a local search would lock on the wrong one), then Gauss-Newton moves x, y and yaw until
-edges found along the normals of the projected ones coincide with them. Everything is in the table frame; the camera's
-pose is taken as exact.
+Four steps, coarse to fine. A grid over contrast-normalised gradients finds where the CAD's visible edges may lie; edges
+are then searched along their normals (iterated closest points, Gauss-Newton). Thin walls give parallel edges, so the
+neighbourhood of each result is scanned with the profile model and the candidate that explains the image best is kept,
+and the same model gives the final, sub-pixel step. Everything is in the table frame; the camera's pose is taken as
+exact.
 """
 
 from __future__ import annotations
@@ -12,35 +13,50 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics
 from perception.edges import EdgeSamples, visible_edges
-from perception.gradients import EdgeImage, Image32, across
+from perception.gradients import EdgeImage, across
+from perception.profiles import ProfileConfig, ProfileModel
 from perception.table_camera import TableCamera
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContourConfig:
-    """How a contour is searched for. Lengths in pixels of the full-resolution crop, angles in radians."""
+    """How a contour is searched for. Lengths in pixels of the full-resolution crop, angles in radians.
+
+    ``starts`` peaks of the grid are followed, each by one Gauss-Newton step for every entry of ``reach_px``; of the
+    scanned neighbourhoods the best ``candidates`` are fitted. ``stride`` thins the samples until the last step.
+    The stated covariance is ``covariance_scale`` times that of independent noise, plus the squares of ``floor_m`` and
+    ``floor_yaw``, as errors on validation crops ask for: parts lean a little, and shading is not even.
+    """
 
     grid_px: float = 8.0
     grid_step_px: float = 2.0
     grid_yaw: float = float(np.radians(5.0))
     grid_yaw_step: float = float(np.radians(1.67))
-    reach_px: tuple[float, ...] = (4.0, 3.0, 2.0, 1.5)
-    final_reach_px: tuple[float, ...] = (1.5, 1.5, 1.5)
-    sample_step_px: float = 0.5
+    starts: int = 2
+    reach_px: tuple[float, ...] = (4.0, 3.0, 2.0)
+    edge_step_px: float = 0.5
+    scan_px: float = 4.0
+    candidates: int = 4
+    stride: int = 4
+    rounds: int = 4
     inlier_px: float = 1.0
-    samples_per_degree_of_freedom: float = 4.0
+    covariance_scale: float = 4.0
+    floor_m: float = 1.2e-5
+    floor_yaw: float = float(np.radians(0.03))
+    profile: ProfileConfig = field(default_factory=ProfileConfig)
 
     def __post_init__(self) -> None:
-        if min(self.reach_px + self.final_reach_px) < 2 * self.sample_step_px:
-            raise ValueError(
-                f"reach {self.reach_px} {self.final_reach_px} must be at least twice the step {self.sample_step_px}"
-            )
+        if min(self.reach_px) < 2 * self.edge_step_px:
+            raise ValueError(f"reach {self.reach_px} must be at least twice the step {self.edge_step_px}")
         if self.grid_px < self.grid_step_px or self.grid_yaw < self.grid_yaw_step:
             raise ValueError("the grid must be at least one step wide")
+        if min(self.starts, self.candidates, self.stride, self.rounds) < 1:
+            raise ValueError("starts, candidates, stride and rounds must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +64,9 @@ class Refinement:
     """A contour laid on the image.
 
     ``x``, ``y`` m and ``yaw`` rad in the table frame with ``covariance`` (3, 3); ``matched_fraction`` of the weighted
-    contour has an edge within a pixel, ``matched_outline`` the same for outlines alone; ``correlation`` in [0, 1] is the
-    mean contrast-normalised gradient across the contour; ``rms_px`` of the matched edges' distances.
+    contour has an edge within a pixel, ``matched_outline`` the same for outlines alone; ``correlation`` in [0, 1] is
+    the mean contrast-normalised gradient across the contour; ``explained`` in [0, 1] the share of the brightness
+    variance along profiles across it that the CAD's patches explain.
     """
 
     x: float
@@ -59,17 +76,7 @@ class Refinement:
     matched_fraction: float
     matched_outline: float
     correlation: float
-    rms_px: float
-
-
-@dataclass(kw_only=True)
-class _Fit:
-    pose: Array
-    covariance: Array = field(default_factory=lambda: np.eye(3))
-    fraction: float = 0.0
-    outline: float = 0.0
-    rms: float = 9.0
-    correlation: float = 0.0
+    explained: float
 
 
 def refine(
@@ -94,88 +101,63 @@ def refine(
     camera = TableCamera(intrinsics=intrinsics, T_cam_table=T_cam_table)
     start = np.array([x, y, yaw])
     samples = visible_edges(part, stable_pose, camera.direction(start))
-    sparse, half = samples.every(3), samples.every(2)
+    sparse = samples.every(config.stride)
+    metres_per_pixel = camera.metres_per_pixel(start)
 
-    near = _grid(edges.coarse, camera, sparse, start, *_steps(config))
-    near = _grid(edges.fine, camera, sparse, near, np.arange(-2, 2.1, 1.0), np.radians([-1.2, -0.6, 0, 0.6, 1.2]))
-    starts = ((near, config.reach_px[2:]), (near, config.reach_px), (start, (6.0, 5.0, *config.reach_px)))
-    fits = [_gauss_newton(edges, camera, half, at, reach, config) for at, reach in starts]
-    best = max(fits, key=lambda fit: fit.correlation)
-    fit = _gauss_newton(edges, camera, samples, best.pose, config.final_reach_px, config)
+    near = [_follow_edges(edges, camera, sparse, at, config) for at in _grid(edges, camera, sparse, start, config)]
+    rough = ProfileModel(sparse, camera, metres_per_pixel, config.profile)
+    pool = [scanned for pose in near for scanned in _scan(edges, rough, pose, config)]
+    best = sorted(pool, key=lambda scored: -scored[0])[: config.candidates]
+    fits = [rough.fit(edges.gray, pose, config.rounds) for _, pose in best]
+    pose = max(fits, key=lambda fit: fit.explained).pose
+
+    exact = ProfileModel(samples, camera, metres_per_pixel, config.profile)
+    fit = exact.fit(edges.gray, pose, config.rounds)
+    matched, matched_outline, correlation = _agreement(edges, camera, samples, fit.pose, config)
     return Refinement(
         x=float(fit.pose[0]),
         y=float(fit.pose[1]),
         yaw=float(fit.pose[2]),
-        covariance=fit.covariance,
-        matched_fraction=fit.fraction,
-        matched_outline=fit.outline,
-        correlation=fit.correlation,
-        rms_px=fit.rms,
+        covariance=fit.covariance * config.covariance_scale
+        + np.diag([config.floor_m**2, config.floor_m**2, config.floor_yaw**2]),
+        matched_fraction=matched,
+        matched_outline=matched_outline,
+        correlation=correlation,
+        explained=fit.explained,
     )
 
 
-def _steps(config: ContourConfig) -> tuple[Array, Array]:
-    shifts = np.arange(-config.grid_px, config.grid_px + 0.1, config.grid_step_px)
-    return shifts, np.arange(-config.grid_yaw, config.grid_yaw + 1e-6, config.grid_yaw_step)
-
-
 def _grid(
-    field_uv: tuple[Image32, Image32],
-    camera: TableCamera,
-    samples: EdgeSamples,
-    pose: Array,
-    shifts: Array,
-    yaws: Array,
-) -> Array:
-    """The pose among shifts (px, both ways) and turns (rad) of ``pose`` whose contour lies on the strongest gradients."""
+    edges: EdgeImage, camera: TableCamera, samples: EdgeSamples, pose: Array, config: ContourConfig
+) -> list[Array]:
+    """The best local maxima of the gradient across the contour, over shifts and turns of ``pose``."""
+    shifts = np.arange(-config.grid_px, config.grid_px + 0.1, config.grid_step_px)
+    yaws = np.arange(-config.grid_yaw, config.grid_yaw + 1e-6, config.grid_yaw_step)
     du, dv = (d.ravel() for d in np.meshgrid(shifts, shifts, indexing="ij"))
-    scores = []
-    for turn in yaws:
-        pixels, normals, _ = camera.project(samples, pose + [0.0, 0.0, turn])
+    scores = np.empty((len(yaws), len(shifts), len(shifts)))
+    for i, turn in enumerate(yaws):
+        pixels, normals, _ = camera.project(samples, pose + np.array([0.0, 0.0, turn]))
         u = (pixels[None, :, 0] + du[:, None]).astype(np.float32)
         v = (pixels[None, :, 1] + dv[:, None]).astype(np.float32)
-        scores.append(np.abs(across(field_uv, u, v, normals)) @ samples.weights)
-    best_turn, best_shift = np.unravel_index(np.argmax(scores), (len(yaws), len(du)))
-    scale = camera.metres_per_pixel(pose)
-    shift_cam = np.array([du[best_shift], dv[best_shift], 0.0]) * scale
-    shift = camera.T_cam_table[:3, :3].T @ shift_cam
-    return pose + [shift[0], shift[1], yaws[best_turn]]
+        response = np.abs(across(edges.coarse, u, v, normals)) @ samples.weights
+        scores[i] = response.reshape(len(shifts), len(shifts))
+    peaks = np.argwhere(scores == maximum_filter(scores, size=3))
+    peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")][: config.starts]
+    return [camera.shifted(pose, shifts[j], shifts[k]) + np.array([0.0, 0.0, yaws[i]]) for i, j, k in peaks]
 
 
-def _gauss_newton(
-    edges: EdgeImage,
-    camera: TableCamera,
-    samples: EdgeSamples,
-    pose: Array,
-    reaches: tuple[float, ...],
-    config: ContourConfig,
-) -> _Fit:
-    """Move ``pose`` so that image edges within each reach (px) fall on the contour; one Gauss-Newton step a reach."""
-    pose = pose.copy()
-    fit = _Fit(pose=pose)
-    for i, reach in enumerate(reaches):
-        last = i >= len(reaches) - 3
-        pixels, normals, jacobian = camera.project(samples, fit.pose)
-        distance, strength = _nearest_edges(edges, pixels, normals, reach, config.sample_step_px)
+def _follow_edges(
+    edges: EdgeImage, camera: TableCamera, samples: EdgeSamples, pose: Array, config: ContourConfig
+) -> Array:
+    """Move ``pose`` towards the image edges within each reach along the contour's normals, one step a reach."""
+    for reach in config.reach_px:
+        pixels, normals, jacobian = camera.project(samples, pose)
+        distance, strength = _nearest_edges(edges, pixels, normals, reach, config.edge_step_px)
         weight = samples.weights * np.minimum(strength / (3 * edges.threshold), 1.0)
         weight[(strength < edges.threshold) | ~normals.any(axis=1)] = 0.0
-        step, hessian, robust, residual = _solve(jacobian, distance, weight, 0.8 if last else max(1.0, 0.7 * reach))
-        fit.pose = fit.pose + np.clip(step, [-6e-4, -6e-4, -0.15], [6e-4, 6e-4, 0.15])
-
-        inlier = (weight > 0) & (np.abs(residual) < config.inlier_px)
-        shown = samples.weights * normals.any(axis=1)
-        mass = robust.sum() + 1e-12
-        variance = float((robust * residual**2).sum() / mass) + 1e-4
-        effective = max(float(inlier.sum()) / config.samples_per_degree_of_freedom, 4.0)
-        fit.covariance = np.linalg.inv(hessian / mass) * variance / effective
-        fit.fraction = float(shown[inlier].sum() / (shown.sum() + 1e-12))
-        fit.outline = float(shown[inlier & samples.outline].sum() / (shown[samples.outline].sum() + 1e-12))
-        fit.rms = float(np.sqrt(variance))
-    pixels, normals, _ = camera.project(samples, fit.pose)
-    p = pixels.astype(np.float32)
-    response = np.abs(across(edges.fine, p[None, :, 0], p[None, :, 1], normals))[0]
-    fit.correlation = float(response @ samples.weights / (samples.weights @ normals.any(axis=1) + 1e-12))
-    return fit
+        step = _robust_step(jacobian, distance, weight, max(1.0, 0.7 * reach))
+        pose = pose + np.clip(step, [-6e-4, -6e-4, -0.15], [6e-4, 6e-4, 0.15])
+    return pose
 
 
 def _nearest_edges(edges: EdgeImage, pixels: Array, normals: Array, reach: float, step: float) -> tuple[Array, Array]:
@@ -194,17 +176,41 @@ def _nearest_edges(edges: EdgeImage, pixels: Array, normals: Array, reach: float
     return s[j] + step * np.clip(peak, -1.0, 1.0), np.where(is_peak[j - 1, n], at, 0.0)
 
 
-def _solve(jacobian: Array, distance: Array, weight: Array, scale: float) -> tuple[Array, Array, Array, Array]:
-    """Robust (Tukey) least squares for the step (3,): also the Hessian (3, 3), weights (N,) and residuals (N,)."""
-    step, residual = np.zeros(3), distance
-    unit = np.array([1e-4, 1e-4, 1e-2])  # about a pixel each, so that the ridge below is even
-    hessian, robust = np.eye(3), weight
+def _robust_step(jacobian: Array, distance: Array, weight: Array, scale: float) -> Array:
+    """Robust (Tukey) least squares for the step (3,) that removes the distances (N,)."""
+    unit = np.array([1e-4, 1e-4, 1e-2])  # about a pixel each, so that the ridge is even
+    scaled, residual, step = jacobian * unit, distance, np.zeros(3)
     for _ in range(3):
         robust = weight * np.clip(1 - (residual / (2.2 * scale)) ** 2, 0.0, 1.0) ** 2
-        scaled = jacobian * unit
         normal = (scaled * robust[:, None]).T @ scaled
         ridge = 1e-6 * (np.trace(normal) + 1e-3) * np.eye(3)
-        step = np.linalg.solve(normal + ridge, (scaled * robust[:, None]).T @ distance) * unit
-        residual = distance - jacobian @ step
-        hessian = (normal + ridge) / np.outer(unit, unit)
-    return step, hessian, robust, residual
+        step = np.linalg.solve(normal + ridge, (scaled * robust[:, None]).T @ distance)
+        residual = distance - scaled @ step
+    return step * unit
+
+
+def _scan(edges: EdgeImage, model: ProfileModel, pose: Array, config: ContourConfig) -> list[tuple[float, Array]]:
+    """Local maxima of the explained share over whole-pixel shifts of ``pose``, each with the shifted pose."""
+    shifts = np.arange(-config.scan_px, config.scan_px + 0.1)
+    du, dv = (d.ravel() for d in np.meshgrid(shifts, shifts, indexing="ij"))
+    explained = model.explained_at(edges.gray, pose, np.stack([du, dv], axis=1)).reshape(len(shifts), -1)
+    peaks = np.argwhere(explained == maximum_filter(explained, size=3))
+    return [(float(explained[j, k]), model.camera.shifted(pose, float(shifts[j]), float(shifts[k]))) for j, k in peaks]
+
+
+def _agreement(
+    edges: EdgeImage, camera: TableCamera, samples: EdgeSamples, pose: Array, config: ContourConfig
+) -> tuple[float, float, float]:
+    """Matched fraction of the contour, of its outlines, and correlation with the gradients at ``pose``."""
+    pixels, normals, _ = camera.project(samples, pose)
+    shown = samples.weights * normals.any(axis=1)
+    distance, strength = _nearest_edges(edges, pixels, normals, 3 * config.inlier_px, config.edge_step_px)
+    matched = shown * ((strength > edges.threshold) & (np.abs(distance) < config.inlier_px))
+    p = pixels.astype(np.float32)
+    response = np.abs(across(edges.fine, p[None, :, 0], p[None, :, 1], normals))[0]
+    total, outline = shown.sum() + 1e-12, shown[samples.outline].sum() + 1e-12
+    return (
+        float(matched.sum() / total),
+        float(matched[samples.outline].sum() / outline),
+        float(response @ samples.weights / total),
+    )

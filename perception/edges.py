@@ -1,9 +1,11 @@
-"""Edges of a part that show in an image, from its CAD: outlines and creases, sampled, with occluded ones left out.
+"""Edges of a part that show in an image, from its CAD: sampled, occluded ones left out, with what lies beside them.
 
-An outline is an edge between a face turned to the camera and one turned away; a crease is one between two visible
-faces that meet at more than 20 degrees (the chords of a rounded bend meet at less and show no edge). Samples are in
-frame ``rest``: the table frame of the part at x = y = yaw = 0, that is ``T_table_part`` applied. What is visible depends
-on the direction to the camera alone, so sets are kept per part, stable pose and direction.
+An outline is where the part ends and the background begins. Inner edges are where depth steps by more than 0.1 mm, or
+the surface turns by more than 20 degrees, from one side to the other (the chords of a rounded bend turn by less and
+show no edge); they count for less, since their contrast is uncertain. Both sides are compared a pixel away from the
+edge, so that relief too fine to be seen is left out. Samples are in frame ``rest``: the table frame of the part at
+x = y = yaw = 0, that is ``T_table_part`` applied. What is visible depends on the direction to the camera alone, so sets
+are kept per part, stable pose and direction.
 """
 
 from __future__ import annotations
@@ -21,26 +23,35 @@ from perception.silhouette import Solid, rasterise, solid_of
 CREASE_ANGLE = np.radians(20.0)
 SAMPLE_STEP_M = 1.2e-4
 OUTLINE_WEIGHT = 1.0
-CREASE_WEIGHT = 0.35
+INNER_WEIGHT = 0.35
 
-_PIXEL_M = 4e-5  # of the orthographic depth map that occlusion is tested against
+PATCH_OFFSETS_M: Array = np.linspace(-4.32e-4, 4.32e-4, 49, dtype=np.float64)
+"""Distances from an edge, along its normal, at which ``EdgeSamples.patches`` says what is seen."""
+MAX_PATCHES = 6
+
+_PIXEL_M = 3e-5  # of the orthographic map that samples are compared with
 _DIRECTION_STEP = 0.02  # rad; directions to the camera are rounded to this
 _GRAZING = 0.02  # sine of the angle under which a face counts as seen edge-on
 _LIFT_M = 5e-5  # a sample is hidden when something lies nearer than this in front of it
+_BESIDE_M = 8e-5  # where the two sides of an edge are compared: a little over a pixel of the camera
+_STEP_M = 1e-4  # a smaller step in depth is a relief that does not show
+_MARGIN = 16  # pixels of background kept round the part
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EdgeSamples:
     """Points on visible edges, in frame ``rest``.
 
-    ``points`` (N, 3) m, ``tangents`` (N, 3) unit, ``weights`` (N,) 1 on outlines and less on creases,
-    ``outline`` (N,) bool. Every sample stands for ``SAMPLE_STEP_M`` of edge.
+    ``points`` (N, 3) m, ``tangents`` (N, 3) unit, ``weights`` (N,) 1 on outlines and less on inner edges, ``outline``
+    (N,) bool. ``patches`` (N, T) numbers the pieces of surface or background seen along the normal at
+    ``PATCH_OFFSETS_M``, from 0 to MAX_PATCHES - 1; the normal is tangent x direction to the camera.
     """
 
     points: Array
     tangents: Array
     weights: Array
     outline: NDArray[np.bool_]
+    patches: NDArray[np.uint8]
 
     def every(self, stride: int) -> EdgeSamples:
         """One sample in ``stride``."""
@@ -49,6 +60,7 @@ class EdgeSamples:
             tangents=self.tangents[::stride],
             weights=self.weights[::stride],
             outline=self.outline[::stride],
+            patches=self.patches[::stride],
         )
 
 
@@ -66,27 +78,31 @@ def visible_edges(part: Part, stable_pose: int, direction: Array) -> EdgeSamples
     return _edges_from(part, stable_pose, int(slope[0]), int(slope[1]))
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1024)
 def _edges_from(part: Part, stable_pose: int, slope_x: int, slope_y: int) -> EdgeSamples:
     towards = np.array([slope_x * _DIRECTION_STEP, slope_y * _DIRECTION_STEP, 1.0])
     towards /= np.linalg.norm(towards)
     solid, T_rest_part = solid_of(part), part.stable_poses[stable_pose].T_table_part
     facing = solid.normals @ (T_rest_part[:3, :3].T @ towards)  # (F,) cosine between normal and view
     a, b = facing[solid.edge_faces].T
-    outline = np.minimum(a, b) * np.maximum(a, b) < 0
+    limb = np.minimum(a, b) * np.maximum(a, b) < 0
     crease = (np.minimum(a, b) > _GRAZING) & (solid.edge_angle > CREASE_ANGLE)
-    chosen = np.flatnonzero(outline | crease)
+    chosen = np.flatnonzero(limb | crease)
 
     edge, points, tangents = _sample(apply(T_rest_part, solid.edge_ends[chosen]))
-    edge = chosen[edge]
-    outward = solid.normals[solid.edge_faces[edge]].sum(axis=1) @ T_rest_part[:3, :3].T
-    seen = ~_hidden(solid, T_rest_part, facing, towards, points, outward)
-    edge, points, tangents = edge[seen], points[seen], tangents[seen]
+    outward = solid.normals[solid.edge_faces[chosen[edge]]].sum(axis=1) @ T_rest_part[:3, :3].T
+    view = _ViewMap.of(solid, T_rest_part, facing, towards)
+    seen = ~view.hidden(points, outward)
+    points, tangents = points[seen], tangents[seen]
+    outline, inner = view.sides(points, tangents)
+    drawn = outline | inner
+    points, tangents, outline = points[drawn], tangents[drawn], outline[drawn]
     return EdgeSamples(
         points=points,
         tangents=tangents,
-        weights=np.where(outline[edge], OUTLINE_WEIGHT, CREASE_WEIGHT),
-        outline=outline[edge],
+        weights=np.where(outline, OUTLINE_WEIGHT, INNER_WEIGHT),
+        outline=outline,
+        patches=view.patches(points, tangents),
     )
 
 
@@ -102,25 +118,78 @@ def _sample(ends: Array) -> tuple[NDArray[np.int64], Array, Array]:
     return edge, ends[edge, 0] + (at - stop[edge] + length[edge])[:, None] * tangents, tangents
 
 
-def _hidden(
-    solid: Solid, T_rest_part: Array, facing: Array, towards: Array, points: Array, outward: Array
-) -> NDArray[np.bool_]:
-    """Which points (N, 3) have part of the surface in front of them, looking against ``towards``.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ViewMap:
+    """A resting part drawn orthographically along a direction: nearness (m), normal and facet of the face seen."""
 
-    A point is moved a pixel outwards, away from the faces it joins, before the depth there is compared.
-    """
-    right = np.cross([0.0, 1.0, 0.0], towards)
-    right /= np.linalg.norm(right)
-    basis = np.stack([right, np.cross(towards, right), towards])  # rows: image right, image up, nearness
-    p_view = apply(T_rest_part, solid.vertices) @ basis.T
-    low = p_view[:, :2].min(axis=0) - 3 * _PIXEL_M
-    size = np.ceil((p_view[:, :2].max(axis=0) - low) / _PIXEL_M).astype(int) + 4
-    uv = (p_view[:, :2] - low) / _PIXEL_M
-    nearness, _ = rasterise(uv, p_view[:, 2], solid.faces[facing > 0], int(size[0]), int(size[1]))
+    basis: Array  # (3, 3), rows: image right, image up, nearness
+    low: Array
+    nearness: Array
+    normals: Array
+    facet: NDArray[np.int32]
 
-    q = points @ basis.T
-    aside = outward @ basis[:2].T
-    norm = np.linalg.norm(aside, axis=1, keepdims=True)
-    q_px = (q[:, :2] - low) / _PIXEL_M + np.where(norm > 0.05, aside / np.maximum(norm, 1e-9), 0.0)
-    col, row = np.round(q_px).astype(int).T
-    return nearness[row, col] > q[:, 2] + _LIFT_M
+    @staticmethod
+    def of(solid: Solid, T_rest_part: Array, facing: Array, towards: Array) -> _ViewMap:
+        right = np.cross([0.0, 1.0, 0.0], towards)
+        right /= np.linalg.norm(right)
+        basis = np.stack([right, np.cross(towards, right), towards])
+        p_view = apply(T_rest_part, solid.vertices) @ basis.T
+        low = p_view[:, :2].min(axis=0) - _MARGIN * _PIXEL_M
+        size = np.ceil((p_view[:, :2].max(axis=0) - low) / _PIXEL_M).astype(int) + _MARGIN + 1
+        front = np.flatnonzero(facing > 0)
+        uv = (p_view[:, :2] - low) / _PIXEL_M
+        nearness, face = rasterise(uv, p_view[:, 2], solid.faces[front], int(size[0]), int(size[1]))
+        on_part = face >= 0
+        return _ViewMap(
+            basis=basis,
+            low=low,
+            nearness=nearness,
+            normals=np.where(on_part[..., None], solid.normals[front[face]] @ T_rest_part[:3, :3].T, 0.0),
+            facet=np.where(on_part, solid.facet[front[face]], np.int32(-1)),
+        )
+
+    def _cell(self, q: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row and column of view coordinates (..., 2) in metres, those outside moved to the border."""
+        cell = np.round((q - self.low) / _PIXEL_M).astype(int)
+        height, width = self.facet.shape
+        return np.clip(cell[..., 1], 0, height - 1), np.clip(cell[..., 0], 0, width - 1)
+
+    def hidden(self, points: Array, outward: Array) -> NDArray[np.bool_]:
+        """Which points (N, 3) have part of the surface in front of them.
+
+        A point is moved a pixel along ``outward`` (N, 3), away from the faces it joins, before depths are compared.
+        """
+        q = points @ self.basis.T
+        aside = outward @ self.basis[:2].T
+        norm = np.linalg.norm(aside, axis=1, keepdims=True)
+        moved = q[:, :2] + np.where(norm > 0.05, aside / np.maximum(norm, 1e-9), 0.0) * _PIXEL_M
+        return self.nearness[self._cell(moved)] > q[:, 2] + _LIFT_M
+
+    def _normals(self, tangents: Array) -> Array:
+        """Unit normals (N, 2) of edges in the view: tangent x direction to the camera."""
+        along = tangents @ self.basis[:2].T
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        return np.stack([along[:, 1], -along[:, 0]], axis=1) / np.maximum(length, 1e-9)
+
+    def sides(self, points: Array, tangents: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which edge samples lie between part and background, and which show inside of the part.
+
+        The latter are where depth steps, or the normal turns, from one side of the edge to the other.
+        """
+        q, aside = points @ self.basis[:2].T, self._normals(tangents) * _BESIDE_M
+        left, right = self._cell(q + aside), self._cell(q - aside)
+        on_left, on_right = np.isfinite(self.nearness[left]), np.isfinite(self.nearness[right])
+        both = on_left & on_right
+        step = np.abs(np.where(both, self.nearness[left], 0.0) - np.where(both, self.nearness[right], 0.0)) > _STEP_M
+        turned = (self.normals[left] * self.normals[right]).sum(axis=1) < np.cos(CREASE_ANGLE)
+        return on_left ^ on_right, both & (step | turned)
+
+    def patches(self, points: Array, tangents: Array) -> NDArray[np.uint8]:
+        """What is seen beside each sample, (N, T); where there are too many patches the outer ones are merged."""
+        q, aside = points @ self.basis[:2].T, self._normals(tangents)
+        label = self.facet[self._cell(q[:, None] + PATCH_OFFSETS_M[:, None] * aside[:, None])]
+        change = np.zeros(label.shape, dtype=np.int64)
+        change[:, 1:] = label[:, 1:] != label[:, :-1]
+        number = np.cumsum(change, axis=1)
+        middle = number[:, len(PATCH_OFFSETS_M) // 2, None]
+        return np.clip(number - middle + MAX_PATCHES // 2, 0, MAX_PATCHES - 1).astype(np.uint8)

@@ -21,10 +21,12 @@ SCORE_SIGMA_PX = 1.2
 class EdgeImage:
     """Gradients of one gray crop, shared by every hypothesis tried on it.
 
-    ``gradient`` are the derivatives (grey levels a pixel) along u and v; ``threshold`` the smallest derivative that
-    counts as an edge; ``coarse`` and ``fine`` are contrast-normalised derivatives, magnitude below 1.
+    ``gray`` is the image itself, ``gradient`` its derivatives (grey levels a pixel) along u and v, ``threshold`` the
+    smallest derivative that counts as an edge; ``coarse`` and ``fine`` are contrast-normalised derivatives, magnitude
+    below 1.
     """
 
+    gray: Image32
     gradient: tuple[Image32, Image32]
     threshold: float
     coarse: tuple[Image32, Image32]
@@ -35,6 +37,7 @@ class EdgeImage:
         """Gradients of a gray image (H, W)."""
         gu, gv = _derivatives(gray, FINE_SIGMA_PX)
         return EdgeImage(
+            gray=gray.astype(np.float32),
             gradient=(gu, gv),
             threshold=max(1.0, 2.2 * float(np.median(np.hypot(gu, gv)))),
             coarse=_normalised(*_derivatives(gray, COARSE_SIGMA_PX)),
@@ -52,7 +55,7 @@ def _derivatives(gray: NDArray[np.uint8], sigma_px: float) -> tuple[Image32, Ima
 def _normalised(gu: Image32, gv: Image32) -> tuple[Image32, Image32]:
     squared = gu * gu + gv * gv
     floor = 2.5 * float(np.sqrt(np.median(squared))) + 0.6
-    scale = 1.0 / np.sqrt(squared + np.float32(floor * floor))
+    scale = np.reciprocal(np.sqrt(squared + np.float32(floor * floor)), dtype=np.float32)
     return gu * scale, gv * scale
 
 

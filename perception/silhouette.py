@@ -18,8 +18,9 @@ from scipy.sparse.csgraph import connected_components
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics, apply
 
-SMOOTH_ANGLE = np.radians(8.0)
-"""Triangles whose normals differ by less belong to one facet."""
+_NORMAL_BINS = 4.0
+"""Neighbouring triangles whose normals round to the same multiples of 1/4 (about 15 degrees) form one facet, so that
+flats stay whole and rounded bends fall into strips of nearly even brightness."""
 
 _MIN_AREA_PX2 = 1e-7
 _EDGE_SLACK_PX = 1e-9
@@ -42,9 +43,9 @@ class PartView:
 class Solid:
     """A part's surface made ready for drawing, in frame ``part``.
 
-    ``vertices`` (V, 3) m, ``faces`` (F, 3) into them, ``normals`` (F, 3) outward, ``facet`` (F,) label of the smooth
-    piece of surface a face belongs to; ``edge_ends`` (E, 2, 3) m, ``edge_faces`` (E, 2) and ``edge_angle`` (E,) rad
-    describe every edge between two faces that are not coplanar.
+    ``vertices`` (V, 3) m, ``faces`` (F, 3) into them, ``normals`` (F, 3) outward, ``facet`` (F,) label of the piece of
+    surface of nearly one normal that a face belongs to; ``edge_ends`` (E, 2, 3) m, ``edge_faces`` (E, 2) and
+    ``edge_angle`` (E,) rad describe every edge between two faces that are not coplanar.
     """
 
     vertices: Array
@@ -64,7 +65,9 @@ def solid_of(part: Part) -> Solid:
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     pairs, angles = mesh.face_adjacency, mesh.face_adjacency_angles
     n_faces = len(mesh.faces)
-    smooth = pairs[angles < SMOOTH_ANGLE]
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)
+    rounded = np.round(normals * _NORMAL_BINS)
+    smooth = pairs[(rounded[pairs[:, 0]] == rounded[pairs[:, 1]]).all(axis=1)]
     graph = coo_matrix((np.ones(len(smooth)), (smooth[:, 0], smooth[:, 1])), shape=(n_faces, n_faces))
     _, facet = connected_components(graph, directed=False)
     bent = angles > 1e-4
@@ -72,7 +75,7 @@ def solid_of(part: Part) -> Solid:
     return Solid(
         vertices=vertices,
         faces=np.asarray(mesh.faces, dtype=np.int64),
-        normals=np.asarray(mesh.face_normals, dtype=np.float64),
+        normals=normals,
         facet=facet.astype(np.int32),
         edge_ends=vertices[mesh.face_adjacency_edges[bent]],
         edge_faces=np.asarray(pairs[bent], dtype=np.int64),

@@ -27,7 +27,7 @@ class TableCamera:
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         R_cam_table = self.T_cam_table[:3, :3]
         turned = samples.points @ R.T
-        p_cam = (turned + [x, y, 0.0]) @ R_cam_table.T + self.T_cam_table[:3, 3]
+        p_cam = (turned + np.array([x, y, 0.0])) @ R_cam_table.T + self.T_cam_table[:3, 3]
         k, z = self.intrinsics, p_cam[:, 2]
         ray_u, ray_v = p_cam[:, 0] / z, p_cam[:, 1] / z
         pixels = np.stack([k.fx * ray_u + k.cx, k.fy * ray_v + k.cy], axis=1)
@@ -54,6 +54,11 @@ class TableCamera:
         dx, dy, dz = inverse(self.T_cam_table)[:3, 3] - [x, y, 0.0]
         c, s = np.cos(yaw), np.sin(yaw)
         return np.array([c * dx + s * dy, -s * dx + c * dy, dz])
+
+    def shifted(self, pose: Array, du: float, dv: float) -> Array:
+        """The pose whose image is that of ``pose`` moved by (du, dv) pixels, to first order."""
+        shift = self.T_cam_table[:3, :3].T @ (np.array([du, dv, 0.0]) * self.metres_per_pixel(pose))
+        return pose + np.array([shift[0], shift[1], 0.0])
 
     def metres_per_pixel(self, pose: Array) -> float:
         """Size on the table of a pixel at the part."""
