@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cad.parts import load_part
 from cad.spatial import Array, Intrinsics, apply, inverse
 from perception.estimates import Frame, FrameEstimate, PartEstimate
+from perception.silhouette import silhouette_mask
 
 Image = NDArray[np.uint8]
 
@@ -24,8 +27,10 @@ OVERVIEW = 4  # the frame is shown at a quarter of its size
 def annotate(frame: Frame, estimate: FrameEstimate, chosen: Array | None = None, opening_m: float = 0.0) -> Image:
     """The frame with masks, boxes and axes, the chosen grasp, and a full-size inset of every part.
 
-    ``chosen`` is ``T_cam_tcp`` (4, 4) of the grasp to come and ``opening_m`` the opening of the fingers. Returns RGB.
+    ``chosen`` is ``T_cam_tcp`` (4, 4) of the grasp to come and ``opening_m`` the opening of the fingers. A part without
+    a mask is drawn with the silhouette of its CAD at the estimated pose. Returns RGB.
     """
+    estimate = replace(estimate, parts=tuple(_with_mask(p, frame.intrinsics) for p in estimate.parts))
     overview = cv2.resize(frame.image, None, fx=1 / OVERVIEW, fy=1 / OVERVIEW, interpolation=cv2.INTER_AREA)
     for part in estimate.parts:
         u, v, w, h = _box(part, frame.intrinsics)
@@ -49,11 +54,17 @@ def save_picture(path: Path, image: Image) -> None:
     os.replace(temporary, path)
 
 
+def _with_mask(part: PartEstimate, camera: Intrinsics) -> PartEstimate:
+    if part.mask is not None:
+        return part
+    mask, origin = silhouette_mask(load_part(part.part), part.T_cam_part, camera)
+    return replace(part, mask=mask, mask_origin=origin)
+
+
 def _inset(frame: Frame, part: PartEstimate, chosen: Array | None, opening_m: float) -> Image:
-    centre = frame.intrinsics.project(part.T_cam_part[:3, 3])
-    width, height = frame.intrinsics.width, frame.intrinsics.height
-    x0 = int(np.clip(centre[0] - INSET / 2, 0, width - INSET))
-    y0 = int(np.clip(centre[1] - INSET / 2, 0, height - INSET))
+    u, v, w, h = _box(part, frame.intrinsics)
+    x0 = int(np.clip(u + (w - INSET) / 2, 0, frame.intrinsics.width - INSET))
+    y0 = int(np.clip(v + (h - INSET) / 2, 0, frame.intrinsics.height - INSET))
     image = frame.image[y0 : y0 + INSET, x0 : x0 + INSET].copy()
     camera = frame.intrinsics.crop(x0, y0, INSET, INSET)
     if part.mask is not None:
@@ -134,5 +145,9 @@ def _colour(part: PartEstimate) -> tuple[int, int, int]:
 
 
 def _text(image: Image, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
+    """Text with its baseline at ``at`` on a dark strip."""
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)
+    u, v = at[0], max(at[1], height + 2)
+    strip = image[max(v - height - 3, 0) : v + below, max(u - 3, 0) : u + width + 3]
+    strip[:] = strip // 4
+    cv2.putText(image, text, (u, v), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)

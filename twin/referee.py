@@ -32,8 +32,10 @@ class Rules:
     place_rad: float = np.radians(3.0)
     disturb_m: float = 0.5e-3
     disturb_rad: float = np.radians(2.0)
-    rest_speed: float = 1e-3  # m/s
-    rest_rate: float = 0.05  # rad/s
+    settle_s: float = 1.0
+    rest_window_s: float = 0.2  # a part that moves less than this within the window is at rest
+    rest_m: float = 20e-6
+    rest_rad: float = np.radians(0.2)
     beside_m: float = 0.015  # the board "under the part" reaches this far from the part's centre
 
 
@@ -104,7 +106,6 @@ class Referee:
         self._model, self._data, self._config, self._parts = model, data, config, list(parts)
         self._rules = rules or Rules()
         self._bodies = np.array([model.body(f"part_{i:02d}").id for i in range(len(parts))])
-        self._dofs = np.array([model.joint(f"part_{i:02d}").dofadr[0] for i in range(len(parts))])
         self._tcp = model.site("tcp").id
         self._kind = self._classify_geoms()
         self._hull = [p.mesh.convex_hull.vertices for p in parts]
@@ -159,11 +160,20 @@ class Referee:
                 self._hold(i)
 
     def finish(self) -> list[PartRecord]:
-        """Close the last attempt and judge where every part lies; call once the world is at rest."""
+        """Let the world come to rest, close the last attempt and judge where every part lies."""
+        self._step(self._rules.settle_s)
+        before = self.poses()
+        self._step(self._rules.rest_window_s)
         self._close_attempt()
         for i, record in enumerate(self.records):
-            self._judge_place(i, record)
+            distance, angle = pose_difference(self._parts[i], before[i], self._pose(i))
+            self._judge_place(i, record, distance <= self._rules.rest_m and angle <= self._rules.rest_rad)
         return self.records
+
+    def _step(self, seconds: float) -> None:
+        for _ in range(round(seconds / self._model.opt.timestep)):
+            mujoco.mj_step(self._model, self._data)
+            self.watch()
 
     # -- during an attempt --------------------------------------------------------------------------------------
 
@@ -247,15 +257,11 @@ class Referee:
 
     # -- judging ------------------------------------------------------------------------------------------------
 
-    def _judge_place(self, i: int, record: PartRecord) -> None:
+    def _judge_place(self, i: int, record: PartRecord, at_rest: bool) -> None:
         part, T = self._parts[i], self._pose(i)
         pose = part.stable_poses[record.stable_pose]
         errors = [pose_difference(part, T_nest @ pose.T_table_part, T) for T_nest in self._nests[part.name]]
         n = int(np.argmin([e[0] for e in errors]))
-        speed = self._data.qvel[self._dofs[i] : self._dofs[i] + 6]
-        at_rest = (
-            np.linalg.norm(speed[:3]) < self._rules.rest_speed and np.linalg.norm(speed[3:]) < self._rules.rest_rate
-        )
         near = errors[n][0] < 0.02
         record.nest = n if near else None
         record.place_error_m, record.place_error_rad = errors[n] if near else (None, None)

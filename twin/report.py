@@ -51,7 +51,10 @@ def print_scorecard(card: dict[str, Any], out: Path) -> None:
             end_section=name == names[-2],
         )
     console.print(table)
-    console.print("errors: means over the parts of the first look whose class, face and yaw branch are right")
+    console.print(
+        "x, y, z, theta: mean errors (mm, degrees) of the parts of the first look whose class, face and yaw branch are "
+        "right; branch: their share"
+    )
     failures = ", ".join(f"{k} {v}" for k, v in card["failures"].items() if v) or "none"
     console.print(
         f"succeeded {picks['succeeded']} of {picks['presented']} presented "

@@ -29,9 +29,6 @@ from twin.scorecard import SceneResult
 from twin.sim_camera import SimCamera
 from twin.sim_robot import SimRobot
 
-SETTLE_S = 1.0
-"""Simulated time after the last pick before the referee judges where the parts lie."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPlacement:
@@ -109,8 +106,6 @@ class SceneTrial:
         try:
             attempts = controller.run()
             self._watch.lap("robot")
-            for _ in range(round(SETTLE_S / self._model.opt.timestep)):
-                mujoco.mj_step(self._model, self._data)
             records = self._referee.finish()
         finally:
             self._renderer.close()

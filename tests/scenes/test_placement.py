@@ -35,5 +35,5 @@ def test_the_seed_decides_the_scene():
 
 def test_too_many_parts_are_refused_with_the_remedy():
     crowded = CellConfig(pick_area_half_m=(0.012, 0.012))
-    with pytest.raises(SceneError, match="drop fewer parts"):
+    with pytest.raises(SceneError, match="pick_area_half_m"):
         settle_parts(crowded, ["main"] * 4, np.random.default_rng(0))

@@ -65,9 +65,6 @@ class Stage:
         self.line(transform(t=[0.0, 0.0, 0.06]) @ self.robot.observe().T_base_tcp)
 
     def finish(self):
-        for _ in range(1600):
-            mujoco.mj_step(self.model, self.data)
-            self.referee.watch()
         return self.referee.finish()
 
     def nest(self, name="top", index=0):
