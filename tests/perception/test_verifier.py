@@ -7,7 +7,7 @@ from perception.faces import FaceTable
 from perception.labels import CropLabels
 from perception.verifier import RECTIFIED, PairSampler, Verifier, listwise, rectify, score_views, verifier_loss
 
-TABLE = FaceTable.load()
+TABLE = FaceTable.load(["top"])
 
 
 def arrow(yaw: float, centre) -> np.ndarray:
@@ -41,7 +41,7 @@ def test_rectifying_turns_any_yaw_to_zero_about_the_centre() -> None:
 
 
 def test_pairs_hold_the_upright_view_and_targets_sum_to_one() -> None:
-    labels = labels_of([0, 3, 7, -1] * 5)
+    labels = labels_of([0, 1, 2, -1] * 5)
     images = np.stack([arrow(yaw, centre) for yaw, centre in zip(labels.yaw, labels.centre, strict=True)])
     views, rays, target = PairSampler(TABLE)(images, labels, np.random.default_rng(1))
     assert views.shape == (40, RECTIFIED, RECTIFIED, 3) and np.allclose(np.linalg.norm(rays, axis=1), np.sqrt(0.02))
@@ -62,7 +62,7 @@ def test_listwise_is_a_distribution_whatever_the_number_of_views() -> None:
 
 
 def test_loss_is_least_for_the_target_itself() -> None:
-    labels = labels_of([0, 4, -1])
+    labels = labels_of([0, 2, -1])
     sampler = PairSampler(TABLE)
     _, _, target = sampler(np.zeros((3, 128, 128, 3), np.uint8), labels, np.random.default_rng(2))
     inside = torch.from_numpy(sampler.within_part(labels))
