@@ -76,8 +76,8 @@ def _pose_views(part: Part, pose: StablePose, intrinsics: Intrinsics) -> list[ND
     pictures = []
     with ClassicRenderer(model, max_width=TILE_PX, max_height=TILE_PX) as renderer:
         for T_world_cam in views:
-            set_camera_pose(model, T_world_cam)
             mujoco.mj_forward(model, data)
+            set_camera_pose(model, data, T_world_cam)
             rgb = renderer.render(data, intrinsics, ("rgb",)).rgb
             assert rgb is not None
             pictures.append(rgb.copy())

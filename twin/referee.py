@@ -144,7 +144,7 @@ class Referee:
         robot = (kinds <= ROBOT) & (kinds >= RIGHT_PAD)
         rows = np.nonzero(robot.any(axis=1))[0]
         pads: dict[int, set[int]] = {}
-        for row in rows:
+        for row in map(int, rows):
             if robot[row].all():
                 continue
             mine, other = (0, 1) if robot[row, 0] else (1, 0)

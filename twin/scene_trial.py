@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,7 @@ from twin.oracle import OracleEstimator
 from twin.pick_config import PickConfig
 from twin.pictures import annotate, grasp_in_camera, save_picture
 from twin.referee import Referee
+from twin.robot import RobotError
 from twin.scorecard import SceneResult
 from twin.sim_camera import SimCamera
 from twin.sim_robot import SimRobot
@@ -75,11 +77,11 @@ class SceneTrial:
         self._model = build_workcell(cell, instances).compile()
         self._data = mujoco.MjData(self._model)
         T_board_cam = CameraPlacement().sample(cell.T_board_cam, np.random.default_rng(mount))
-        set_camera_pose(self._model, cell.T_world_board @ T_board_cam)
         set_parts(self._model, self._data, T_world_part)
         for name, q in zip(JOINT_NAMES, cell.home_q, strict=True):
             self._data.joint(name).qpos[0] = q
         mujoco.mj_forward(self._model, self._data)
+        set_camera_pose(self._model, self._data, T_board_cam)  # the camera's mount is part of the board's body
         self._robot = SimRobot(self._model, self._data, cell, on_step=self._step)
         width, height = cell.intrinsics.width, cell.intrinsics.height
         self._renderer = ClassicRenderer(self._model, max_width=width, max_height=height)
@@ -88,7 +90,9 @@ class SceneTrial:
         self._referee = Referee(self._model, self._data, cell, self._parts)
         self._beliefs = [Beliefs() for _ in self._parts]
         self._target: int | None = None
-        self._looks, self._cycles, self._cycle_start = 0, [], 0.0
+        self._cycles: list[float] = []
+        self._cycle_start, self._looked_once = 0.0, False
+        self._pending: tuple[Frame, FrameEstimate] | None = None
         self._watch.lap("build")
 
     def run(self, on_attempt: Callable[[Attempt], None] | None = None) -> SceneResult:
@@ -104,11 +108,14 @@ class SceneTrial:
             on_event=self._on_event,
         )
         try:
-            attempts = controller.run()
+            with suppress(RobotError):  # a protective stop ends the scene; what is left on the board counts as failed
+                controller.run()
             self._watch.lap("robot")
+            self._draw_pending()
             records = self._referee.finish()
         finally:
             self._renderer.close()
+        attempts = controller.attempts
         for attempt in attempts:
             i = self._nearest(attempt.T_base_part, attempt.part)
             if not attempt.tried and i is not None:
@@ -140,8 +147,7 @@ class SceneTrial:
                 self._referee.begin_attempt()
                 self._target = self._nearest(event.attempt.T_base_part, event.attempt.part)
                 self._cycle_start = event.attempt.look_time_s
-                self._picture(event.frame, event.estimate, event.attempt)
-                self._watch.lap("pictures")
+                self._draw_pending(event.attempt)
             case AttemptFinished():
                 if self._target is not None:
                     self._beliefs[self._target].attempts.append(event.attempt)
@@ -151,25 +157,29 @@ class SceneTrial:
                 self._watch.lap("robot")
 
     def _looked(self, frame: Frame, estimate: FrameEstimate) -> None:
-        self._looks += 1
-        if self._looks == 1:
+        if not self._looked_once:
+            self._looked_once = True
             T_cam_parts = inverse(camera_pose(self._model, self._data)) @ self._referee.poses()
             found = match(estimate.parts, self._classes, self._parts, T_cam_parts)
             for i, seen in found.items():
                 self._beliefs[i].estimate = seen
                 self._beliefs[i].error = pose_error(self._parts[i], T_cam_parts[i], seen)
-        if not estimate.parts:
-            self._picture(frame, estimate, None)
+        self._draw_pending()
+        self._pending = frame, estimate
+        self._watch.lap("pictures")
 
-    def _picture(self, frame: Frame, estimate: FrameEstimate, attempt: Attempt | None) -> None:
-        if not self._config.pictures:
+    def _draw_pending(self, attempt: Attempt | None = None) -> None:
+        """Save the picture of the last look, with the grasp it led to if it led to one."""
+        if self._pending is None or not self._config.pictures:
             return
+        (frame, estimate), self._pending = self._pending, None
         chosen, opening = None, 0.0
         if attempt is not None and attempt.T_base_tcp is not None:
             chosen = grasp_in_camera(attempt.T_base_tcp, self._cell.T_world_board, estimate.T_cam_board)
             opening = attempt.approach_opening_m or 0.0
-        name = f"scene_{self._scene:03d}_look_{self._looks:02d}.jpg"
+        name = f"scene_{self._scene:03d}_time_{frame.time_s:07.2f}.jpg"
         save_picture(self._config.out / "frames" / name, annotate(frame, estimate, chosen, opening))
+        self._watch.lap("pictures")
 
     def _nearest(self, T_world_part: Array, name: str) -> int | None:
         """Index of the presented part that lies where an estimate says, None when none is within 10 mm."""

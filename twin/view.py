@@ -38,7 +38,7 @@ def save_views(out: Path, *, seed: int, parts_per_class: int = 2) -> list[Path]:
         rgb = renderer.render(data, cell.intrinsics, ("rgb",)).rgb
     assert rgb is not None
     height = FRAME_WIDTH * cell.intrinsics.height // cell.intrinsics.width
-    frame = cv2.resize(rgb, (FRAME_WIDTH, height), interpolation=cv2.INTER_AREA)
+    frame = np.asarray(cv2.resize(rgb, (FRAME_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
     hover = transform(rotation_x(np.pi), [*T_world_part[0, :2, 3], cell.T_world_board[2, 3] + 0.06])
     _set_arm(data, ArmIk(build_arm(cell).compile(), np.array(cell.home_q)).solve(hover))
     mujoco.mj_forward(model, data)
