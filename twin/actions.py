@@ -9,7 +9,7 @@ import numpy as np
 
 from cad.spatial import Array, transform
 from twin.attempts import Calibration, ControllerConfig, Outcome
-from twin.grasps import GraspChoice
+from twin.grasp_choice import GraspChoice
 from twin.ik import ArmIk
 from twin.profiles import speed_for
 from twin.robot import GripState, Robot, RobotState

@@ -24,7 +24,8 @@ from twin.attempts import (
     Looked,
     Outcome,
 )
-from twin.grasps import GraspChoice, GraspConfig, PlacedPart, choose_grasp, read_grasps
+from twin.grasp_choice import GraspChoice, PlacedPart, choose_grasp
+from twin.grasps import GraspConfig, read_grasps
 from twin.ik import ArmIk, IkError
 from twin.robot import Camera, MotionRefused, Robot, RobotError, TwinError
 

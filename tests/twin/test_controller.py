@@ -13,7 +13,7 @@ from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionE
 from scenes.workcell import CellConfig, build_arm
 from twin.attempts import OUTCOMES, AttemptFinished, AttemptStarted, Calibration, ControllerConfig, Looked
 from twin.controller import ControllerError, PickController
-from twin.grasps import GraspError, write_grasps
+from twin.grasps import GraspConfig, GraspError, write_grasps
 from twin.ik import ArmIk
 from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
 
@@ -183,7 +183,7 @@ class World:
 @pytest.fixture
 def brick(make_part):
     part = make_part(trimesh.creation.box([8e-3, 6e-3, 3e-3]))
-    write_grasps(part)
+    write_grasps(part, GraspConfig(sample_spacing_m=0.2e-3, yaw_step=np.pi / 6))
     return part
 
 

@@ -5,6 +5,7 @@ import trimesh
 from cad import gripper
 from cad.parts import StablePose, load_part, planar
 from cad.spatial import apply, inverse, rotation_x, rotation_z, transform
+from twin.grasp_choice import PlacedPart, choose_grasp
 from twin.grasp_geometry import (
     ContactRules,
     PadContact,
@@ -16,7 +17,7 @@ from twin.grasp_geometry import (
     topples,
     view_along,
 )
-from twin.grasps import GraspConfig, GraspError, PlacedPart, choose_grasp, find_grasps, read_grasps, write_grasps
+from twin.grasps import GraspConfig, GraspError, find_grasps, read_grasps, write_grasps
 from twin.ik import top_down
 from twin.robot import TwinError
 
