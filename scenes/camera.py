@@ -38,12 +38,18 @@ def set_intrinsics(model: mujoco.MjModel, intrinsics: Intrinsics, name: str = CA
     model.cam_intrinsic[i] = [*focal_m, *_principal_m(intrinsics)]
 
 
-def set_camera_pose(model: mujoco.MjModel, T_body_cam: Array, name: str = CAMERA) -> None:
-    """Move a compiled camera to ``T_body_cam`` (4, 4, OpenCV's camera axes) on its body; takes effect on forward."""
+def set_camera_pose(model: mujoco.MjModel, data: mujoco.MjData, T_body_cam: Array, name: str = CAMERA) -> None:
+    """Move a compiled camera to ``T_body_cam`` (4, 4, OpenCV's camera axes) on its body, whose pose must be known.
+
+    The pose in ``data`` is set as well: where bodies may sleep MuJoCo computes it once for a body that never moves.
+    """
     i = model.camera(name).id
     T_body_camgl = T_body_cam @ CAM_FROM_CAMGL
     model.cam_pos[i] = T_body_camgl[:3, 3]
     model.cam_quat[i] = quat_wxyz_from_rotation(T_body_camgl[:3, :3])
+    body = model.cam_bodyid[i]
+    T_world_camgl = transform(data.xmat[body].reshape(3, 3), data.xpos[body]) @ T_body_camgl
+    data.cam_xpos[i], data.cam_xmat[i] = T_world_camgl[:3, 3], T_world_camgl[:3, :3].ravel()
 
 
 def camera_pose(model: mujoco.MjModel, data: mujoco.MjData, name: str = CAMERA) -> Array:

@@ -40,6 +40,7 @@ class LookRanges:
     dark_board_share: float = 0.12
     board_tint: float = 0.06
     tag_level: Range = (0.7, 1.1)
+    surroundings_level: Range = (0.1, 0.8)
     highlight: Range = (110.0, 252.0)
     blur_px: Range = (0.4, 1.8)
     shot_noise: Range = (0.005, 0.08)
@@ -79,6 +80,8 @@ DEFAULT_LAMPS = (
 )
 """The pick cell's own two lamps."""
 DEFAULT_AMBIENT = 0.32
+DEFAULT_SURROUNDINGS = 0.52
+"""Brightness of the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +95,7 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """One draw: lamps, ambient light, the plate, the tags' brightness and the generator's state for the rest.
+    """One draw: lamps, ambient light, the plate, the brightness of the tags and of the table round the plate.
 
     ``texture`` is an index into the stage's textures, -1 for a plain plate.
     """
@@ -103,6 +106,7 @@ class Look:
     texture_repeat: float
     board_rgb: tuple[float, float, float]
     tag_level: float
+    surroundings_level: float
     default: bool = field(default=False)
 
 
@@ -117,6 +121,7 @@ def draw_look(ranges: LookRanges, textures: int, rng: np.random.Generator) -> Lo
             texture_repeat=1.0,
             board_rgb=(level, level, level),
             tag_level=1.0,
+            surroundings_level=DEFAULT_SURROUNDINGS,
             default=True,
         )
     textured = rng.random() < ranges.texture_share
@@ -128,6 +133,7 @@ def draw_look(ranges: LookRanges, textures: int, rng: np.random.Generator) -> Lo
         texture_repeat=float(rng.uniform(*ranges.texture_repeat)),
         board_rgb=_tinted(level, ranges.board_tint, rng),
         tag_level=float(rng.uniform(*ranges.tag_level)),
+        surroundings_level=float(rng.uniform(*ranges.surroundings_level)),
     )
 
 

@@ -82,9 +82,9 @@ class Stage:
             self._show(f"part_{instance:02d}", placed)
         for placed in shot.distractors:
             self._show(placed.name, placed)
-        set_camera_pose(model, shot.T_board_cam)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
+        set_camera_pose(model, data, shot.T_board_cam)
         return np.array(instances, np.int16)
 
     def dress(self, shot: Shot, look: Look, ranges: LookRanges, rng: np.random.Generator) -> None:
@@ -97,6 +97,7 @@ class Stage:
         model.mat_rgba[material, :3] = look.board_rgb
         model.mat_texrepeat[material] = [look.texture_repeat, look.texture_repeat * 0.6875]
         model.mat_rgba[model.material("tags").id, :3] = look.tag_level
+        model.mat_rgba[model.material("surroundings").id, :3] = look.surroundings_level
         for geom in self._shown:
             owner = model.geom(geom).name.removesuffix("_visual")
             if owner.startswith("part_"):

@@ -135,12 +135,21 @@ def _add_lights(board: mujoco.MjsBody) -> None:
 
 
 def _add_overview(spec: mujoco.MjSpec) -> None:
-    """A camera for pictures of the whole cell."""
+    """A camera and a backdrop for pictures of the whole cell."""
     eye, target = np.array([1.45, 1.15, 0.95]), np.array([0.30, 0.05, 0.28])
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(z, [0.0, 0.0, 1.0]))
     T_world_cam = transform(np.stack([x, np.cross(z, x), z], axis=1), eye)
     add_camera(spec.worldbody, OVERVIEW_INTRINSICS, T_world_cam, OVERVIEW)
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.85, 0.88, 0.92],
+        rgb2=[0.45, 0.48, 0.52],
+        width=256,
+        height=256,
+    )
 
 
 def _add_hull(spec: mujoco.MjSpec, name: str, hull: trimesh.Trimesh) -> None:
@@ -199,7 +208,8 @@ def _add_cell_visuals(spec: mujoco.MjSpec, config: CellConfig) -> None:
         add_material(spec, name, tuple(entry["rgba"]), specular=specular, shininess=shininess)
         if entry is not nest:
             body = spec.worldbody if entry["body"] == "table" else spec.body(entry["body"])
-            add_visual(body, name, name, material=name)
+            drawn = add_visual(body, name, name, material=name)
+            drawn.castshadow = entry["body"] != "table"
     outline = f"cell_{nest['file'].removesuffix('.stl')}"
     for part in config.tray.classes:
         for k, T_tray_nest in enumerate(config.tray.nests(part)):
