@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cad.parts import load_part, part_names
+from cad.spatial import Array
 from perception.dataset import load_windows, manifest_hash
 from perception.metrics import DetectionScores, mask_iou, summary
 from perception.segmentation import (
@@ -23,6 +24,7 @@ from perception.segmentation import (
     REDUCTION,
     WEIGHTS,
     DecodeConfig,
+    Detection,
     Outputs,
     SegmentationNet,
     Segmenter,
@@ -115,11 +117,10 @@ def example(windows: Windows, rng: np.random.Generator, config: SegmentationTrai
     """A randomly chosen and varied window."""
     window = windows[int(rng.integers(len(windows)))]
     for _ in range(rng.poisson(config.paste)):
-        window = paste(window, flip(windows[int(rng.integers(len(windows)))], rng), rng)
-    window = flip(window, rng)
+        window = paste(window, windows[int(rng.integers(len(windows)))], rng)
     if rng.random() < config.warp:
         window = warp(window, rng)
-    window = cut(window, config.size, rng)
+    window = flip(cut(window, config.size, rng), rng)
     return Window(recolour(window.image, rng), window.instances, window.centres, window.classes)
 
 
@@ -158,36 +159,58 @@ def focal(logits: Tensor, heat: Tensor) -> Tensor:
     return -terms.sum() / (centre.sum() + 1)
 
 
-def evaluate(segmenter: Segmenter, windows: Windows, chosen: Sequence[int] | None = None) -> dict[str, float]:
-    """Figures of ``DetectionScores`` and class accuracy, centre error (frame pixels) and ms an image, on windows."""
-    scores, centre_px, right, seconds = DetectionScores(), [], [], []
-    for index in range(len(windows)) if chosen is None else chosen:
-        window = windows[index]
+@dataclass(frozen=True)
+class Examined:
+    """A window's detections beside its truth: overlaps (D, I) and the visible area of each instance (I,)."""
+
+    window: Window
+    found: list[Detection]
+    iou: Array
+    area_px: NDArray[np.int64]
+    seconds: float
+
+
+def examine(segmenter: Segmenter, windows: Iterable[Window]) -> list[Examined]:
+    """Run the segmenter on windows and compare."""
+    out = []
+    for window in windows:
         start = time.perf_counter()
         found = segmenter.detect_reduced(window.image)
-        seconds.append(time.perf_counter() - start)
+        seconds = time.perf_counter() - start
         truth = [window.instances == k + 1 for k in range(len(window.centres))]
-        iou = np.array([[mask_iou(d.mask, t, d.mask_origin) for t in truth] for d in found])
-        iou = iou.reshape(len(found), len(truth))
-        scores.add(iou, [d.score for d in found], [np.count_nonzero(t) < MIN_VISIBLE_PX for t in truth])
-        for d, detection in enumerate(found):
-            if len(truth) and iou[d].max() >= 0.5:
-                k = int(iou[d].argmax())
-                error = detection.centre_px - ((window.centres[k] + 0.5) * REDUCTION - 0.5)
-                inside = np.all((window.centres[k] > 2) & (window.centres[k] < np.array(truth[k].shape[::-1]) - 3))
-                centre_px += [float(np.linalg.norm(error))] if inside else []
-                right.append(int(detection.class_probabilities.argmax()) == window.classes[k])
+        iou = np.array([[mask_iou(d.mask, t, d.mask_origin) for t in truth] for d in found], np.float64)
+        area = np.array([np.count_nonzero(t) for t in truth], np.int64)
+        out.append(Examined(window, found, iou.reshape(len(found), len(truth)), area, seconds))
+    return out
+
+
+def figures_of(examined: Sequence[Examined], min_score: float = 0.0) -> dict[str, float]:
+    """``DetectionScores.report`` with class accuracy, centre error (frame pixels) and ms an image."""
+    scores, centre_px, right = DetectionScores(), [], []
+    for seen in examined:
+        kept = [d for d, detection in enumerate(seen.found) if detection.score >= min_score]
+        window, iou = seen.window, seen.iou[kept]
+        scores.add(iou, [seen.found[d].score for d in kept], seen.area_px < MIN_VISIBLE_PX)
+        inner = np.array(window.instances.shape[::-1]) - 3
+        for row, d in enumerate(kept):
+            if not iou.shape[1] or iou[row].max() < 0.5:
+                continue
+            k = int(iou[row].argmax())
+            right.append(int(seen.found[d].class_probabilities.argmax()) == window.classes[k])
+            if np.all((window.centres[k] > 2) & (window.centres[k] < inner)):
+                true_px = (window.centres[k] + 0.5) * REDUCTION - 0.5
+                centre_px.append(float(np.linalg.norm(seen.found[d].centre_px - true_px)))
     centre = summary(centre_px)
     return scores.report() | {
         "class_accuracy": float(np.mean(right)) if right else float("nan"),
         "centre_median_px": centre["median"],
         "centre_p95_px": centre["p95"],
-        "image_ms": 1e3 * float(np.median(seconds)),
+        "image_ms": 1e3 * float(np.median([seen.seconds for seen in examined])),
     }
 
 
 def train_segmentation(config: SegmentationTraining) -> None:
-    """Train, pick the decoding thresholds on the validation windows, and keep the weights with their figures."""
+    """Train, pick the score threshold on the validation windows, and keep the weights with their figures."""
     cv2.setNumThreads(config.threads)
     names = part_names()
     parts = [load_part(name) for name in names]
@@ -206,26 +229,24 @@ def train_segmentation(config: SegmentationTraining) -> None:
 
     def validate(model: nn.Module) -> dict[str, float]:
         assert isinstance(model, SegmentationNet)
-        few = range(min(config.validate_windows, len(validation)))
-        figures = evaluate(Segmenter(model, names, DecodeConfig()), validation, few)
+        few = (validation[i] for i in range(min(config.validate_windows, len(validation))))
+        figures = figures_of(examine(Segmenter(model, names, DecodeConfig()), few))
         return {key: figures[key] for key in ("ap50", "precision50", "recall50", "centre_median_px")}
 
     result = train("segmentation", net, step, config, config.out, validate=validate)
     net.load_state_dict(result.state_dict)
-    decode, figures = best_thresholds(net, names, validation)
+    decode, figures = best_threshold(net, names, validation)
     data = {str(path): manifest_hash(path) for path in (config.data, config.val)}
     metadata = weights_metadata(names, config, result, data, figures) | {"decode": asdict(decode)}
     save_weights(config.out / WEIGHTS, result.state_dict, metadata)
     print("  ".join(f"{key} {value:.4f}" for key, value in figures.items()))
 
 
-def best_thresholds(
+def best_threshold(
     net: SegmentationNet, names: Sequence[str], validation: Windows
 ) -> tuple[DecodeConfig, dict[str, float]]:
-    """The thresholds with the highest sum of precision and recall at overlap 0.5, and the figures there."""
-    tried = []
-    for peak in (0.2, 0.3, 0.4):
-        for score in (0.15, 0.25, 0.35, 0.45):
-            config = DecodeConfig(peak=peak, score=score)
-            tried.append((config, evaluate(Segmenter(net, names, config), validation)))
-    return max(tried, key=lambda pair: pair[1]["precision50"] + pair[1]["recall50"])
+    """The score threshold with the highest sum of precision and recall at overlap 0.5, and the figures there."""
+    examined = examine(Segmenter(net, names, DecodeConfig(score=0.05)), (validation[i] for i in range(len(validation))))
+    tried = {score: figures_of(examined, score) for score in np.arange(0.1, 0.8, 0.05).round(2).tolist()}
+    best = max(tried, key=lambda score: np.nan_to_num(tried[score]["precision50"]) + tried[score]["recall50"])
+    return DecodeConfig(score=best), tried[best]

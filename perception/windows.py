@@ -38,6 +38,8 @@ class Windows:
         return len(self.data)
 
     def __getitem__(self, index: int) -> Window:
+        if not 0 <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
         rows = self.data.instances_of[index]
         order = rows[np.argsort(self.data.instance[rows])]
         return Window(

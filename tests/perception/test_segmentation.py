@@ -1,3 +1,6 @@
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -6,9 +9,10 @@ import torch
 from cad.spatial import BASLER
 from perception.estimates import Frame, PerceptionError
 from perception.segmentation import DecodeConfig, Outputs, SegmentationNet, Segmenter, decode, normalise
-from perception.train_segmentation import NO_CLASS, batch_of, focal, losses, targets_of
+from perception.train import main
+from perception.train_segmentation import NO_CLASS, batch_of, examine, figures_of, focal, losses, targets_of
 from perception.training import seeded
-from perception.windows import Window, flip, paste, recolour, warp
+from perception.windows import Window, cut, flip, paste, recolour, warp
 
 SIZE = 128
 
@@ -107,6 +111,21 @@ def test_pasted_parts_never_cover_parts() -> None:
     assert grown > 3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cut_keeps_pixels_and_centres_together(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    window = draw(rng)
+    part = cut(window, 64, rng, near=1.0)
+    assert part.image.shape == (64, 64, 3)
+    assert np.any(np.all((part.centres >= 0) & (part.centres < 65), axis=1))
+    (du, dv), *rest = np.round(window.centres - part.centres).astype(int)
+    assert all((shift == (du, dv)).all() for shift in rest)
+    np.testing.assert_array_equal(part.image, window.image[dv : dv + 64, du : du + 64])
+    np.testing.assert_array_equal(part.instances, window.instances[dv : dv + 64, du : du + 64])
+    with pytest.raises(ValueError, match="cannot cut 200"):
+        cut(window, 200, rng)
+
+
 def test_normalisation_ignores_exposure() -> None:
     rng = np.random.default_rng(0)
     image = recolour(draw(rng).image, rng)
@@ -158,6 +177,52 @@ def test_a_trained_network_finds_parts_at_any_exposure_in_a_frame(trained: Segme
             nearest = min(found, key=lambda d: float(np.hypot(*(d.centre_px - [4 * u, 4 * v]))))
             assert np.hypot(*(nearest.centre_px - [4 * u + 1.5, 4 * v + 1.5])) < 12
             assert nearest.class_probabilities.argmax() == window.classes[k]
+
+
+def test_figures_of_a_trained_network_on_new_windows(trained: SegmentationNet) -> None:
+    rng = np.random.default_rng(7)
+    examined = examine(Segmenter(trained, ["bar", "disc"], DecodeConfig()), (draw(rng) for _ in range(5)))
+    figures = figures_of(examined)
+    assert figures["recall50"] > 0.9 and figures["precision50"] > 0.9 and figures["class_accuracy"] > 0.9
+    assert figures["centre_median_px"] < 8
+    assert figures_of(examined, min_score=1.01)["recall50"] == 0.0
+
+
+def write_windows(folder: Path, count: int) -> Path:
+    """Drawn windows as a data set whose bars and discs pass for parts 1 and 2."""
+    rng = np.random.default_rng(count)
+    chunk = folder / "train" / "000000"
+    for name in ("rgb", "mask_visib"):
+        (chunk / name).mkdir(parents=True)
+    camera, truth = {}, {}
+    for i in range(count):
+        window = draw(rng)
+        cv2.imwrite(str(chunk / "rgb" / f"{i:06d}.png"), window.image)
+        camera[str(i)] = {
+            "cam_K": BASLER.downscaled(4).crop(600, 400, SIZE, SIZE).matrix.ravel().tolist(),
+            "cam_R_w2c": [1, 0, 0, 0, -1, 0, 0, 0, -1],
+            "cam_t_w2c": [0, 0, 700],
+        }
+        pose = {"cam_R_m2c": [1, 0, 0, 0, -1, 0, 0, 0, -1], "cam_t_m2c": [0, 0, 700], "stable_pose": 0}
+        truth[str(i)] = [{"obj_id": int(c) + 1} | pose for c in window.classes]
+        for k in range(len(window.classes)):
+            cv2.imwrite(str(chunk / "mask_visib" / f"{i:06d}_{k:06d}.png"), (window.instances == k + 1) * np.uint8(255))
+    (chunk / "scene_camera.json").write_text(json.dumps(camera))
+    (chunk / "scene_gt.json").write_text(json.dumps(truth))
+    (folder / "dataset.json").write_text(json.dumps({"split": "train", "count": count}))
+    return folder
+
+
+def test_training_from_the_command_line_leaves_weights_that_load(tmp_path: Path) -> None:
+    data = ["--data", str(write_windows(tmp_path / "a", 4)), "--val", str(write_windows(tmp_path / "b", 2))]
+    options = ["--max-steps", "2", "--batch", "2", "--size", "96", "--out", str(tmp_path / "out")]
+    assert main(["segmentation", *data, *options]) == 0
+    stored = json.loads((tmp_path / "out" / "segmentation.json").read_text())
+    assert (
+        stored["steps"] == 2 and set(stored["parts"]) == {"inserted", "main", "top"} and "recall50" in stored["figures"]
+    )
+    assert Segmenter.load(tmp_path / "out").part_names == ("inserted", "main", "top")
+    assert main(["segmentation", *data, *options, "--start", str(tmp_path / "nowhere")]) == 1
 
 
 def test_a_frame_that_is_too_small_is_refused(trained: SegmentationNet) -> None:
