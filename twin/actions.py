@@ -30,10 +30,10 @@ class Actions:
         self._robot, self._ik, self._calibration, self._config = robot, ik, calibration, config
 
     def park(self) -> None:
-        """Bring the arm up and out of the camera's view."""
+        """Bring the arm up and out of the camera's view, straight up first where it is among the parts."""
         config = self._config
         T_base_tcp = self._robot.observe().T_base_tcp
-        if T_base_tcp[2, 3] < self._carry_z:
+        if T_base_tcp[2, 3] < self._board_z + 0.9 * config.hover_m:
             self._line(self._at_height(T_base_tcp, self._carry_z), config.linear_speed, config.linear_acceleration)
         self._robot.move_j(self._calibration.q_park, speed=config.joint_speed, acceleration=config.joint_acceleration)
 
@@ -44,7 +44,7 @@ class Actions:
         self._grip(choice.openings_m[0], config.open_speed)
         q_above = self._ik.solve(transform(t=[0.0, 0.0, config.hover_m]) @ T_base_tcp, choice.q_pick)
         self._robot.move_j(q_above, speed=config.joint_speed, acceleration=config.joint_acceleration)
-        self._line(T_base_tcp, config.touch_speed, config.touch_acceleration)
+        self._down(T_base_tcp, config.linear_speed, config.linear_acceleration)
         closed = self._grip(max(0.0, width - config.overclose_m), config.grip_speed)
         if not self._holds(closed, width):
             self._grip(choice.openings_m[0], config.release_speed)
@@ -71,7 +71,7 @@ class Actions:
         """
         config, width = self._config, choice.grasp.width_m
         T_base_tcp = transform(t=[0.0, 0.0, config.place_gap_m]) @ T_base_part_at_nest @ choice.T_part_tcp
-        self._line(T_base_tcp, config.touch_speed, config.touch_acceleration)
+        self._down(T_base_tcp, config.lift_speed, config.lift_acceleration)
         self._check("place", "lost above the nest", width)
         self._grip(width + 2 * config.release_m, config.release_speed)
         self._grip(choice.openings_m[1], config.open_speed)
@@ -79,14 +79,24 @@ class Actions:
         self._line(above, config.linear_speed, config.linear_acceleration)
 
     @property
+    def _board_z(self) -> float:
+        return float(self._calibration.T_base_board[2, 3])
+
+    @property
     def _carry_z(self) -> float:
-        return float(self._calibration.T_base_board[2, 3]) + self._config.carry_m
+        return self._board_z + self._config.carry_m
 
     def _at_height(self, T_base_tcp: Array, z: float) -> Array:
         return transform(T_base_tcp[:3, :3], [*T_base_tcp[:2, 3], z])
 
     def _line(self, T_base_tcp: Array, speed: float, acceleration: float) -> None:
         self._robot.move_l(T_base_tcp, speed=speed, acceleration=acceleration)
+
+    def _down(self, T_base_tcp: Array, speed: float, acceleration: float) -> None:
+        """Straight down, the last stretch slowly."""
+        config = self._config
+        self._line(transform(t=[0.0, 0.0, config.touch_m]) @ T_base_tcp, speed, acceleration)
+        self._line(T_base_tcp, config.touch_speed, config.touch_acceleration)
 
     def _grip(self, opening_m: float, speed: float) -> RobotState:
         return self._robot.grip(opening_m, force_n=self._config.grip_force_n, speed=speed)

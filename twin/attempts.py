@@ -23,20 +23,22 @@ class ControllerConfig:
     """Heights, speeds and tolerances of the pick-and-place cycle, inside the UR5e's and Hand-E's limits."""
 
     hover_m: float = 0.030
-    """TCP above its grasp height before it goes straight down, and after it has let go."""
+    """TCP above its grasp height before it goes straight down, and after it has let go: above every part's top."""
     carry_m: float = 0.080
     """TCP above the board while a part is carried."""
     place_gap_m: float = 0.15e-3
     """The part's lowest point above the nest when it is let go."""
-    joint_speed: float = 1.6
-    joint_acceleration: float = 5.0
+    joint_speed: float = 2.4
+    joint_acceleration: float = 8.0
     carry_speed: float = 0.9
     carry_acceleration: float = 2.5
     carry_min_s: float = 1.1
     """A carry takes at least this long."""
     linear_speed: float = 0.25
     linear_acceleration: float = 1.2
-    touch_speed: float = 0.06
+    touch_m: float = 0.006
+    """The last stretch down, at ``touch_speed``."""
+    touch_speed: float = 0.05
     touch_acceleration: float = 0.6
     lift_speed: float = 0.15
     lift_acceleration: float = 0.8
@@ -70,8 +72,11 @@ class ControllerConfig:
         low, high = gripper.FORCE_RANGE_N
         if not low <= self.grip_force_n <= high:
             raise ValueError(f"grip_force_n {self.grip_force_n} is outside the Hand-E's {low} .. {high}")
-        if not 0 < self.hover_m <= self.carry_m:
-            raise ValueError(f"hover_m {self.hover_m} must be above 0 and at most carry_m {self.carry_m}")
+        if not 0 < self.touch_m <= self.hover_m <= self.carry_m:
+            raise ValueError(
+                f"heights touch_m {self.touch_m}, hover_m {self.hover_m}, carry_m {self.carry_m} must be above 0 and "
+                "in this order"
+            )
         if self.tries_per_region < 1 or self.idle_looks < 1 or self.max_looks < 1:
             raise ValueError(
                 f"tries_per_region {self.tries_per_region}, idle_looks {self.idle_looks} and max_looks "

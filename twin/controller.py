@@ -174,6 +174,7 @@ class PickController:
             [p for nests in self._in_nests.values() for p in nests.values()],
             self._grasps[name][k],
             self._ik.solve,
+            self._calibration.q_park,
             self._grasp_config,
         )
         if isinstance(choice, str):

@@ -52,11 +52,13 @@ def choose_grasp(
     nest_neighbours: Sequence[PlacedPart],
     grasps: Sequence[Grasp],
     solve: Callable[[Array], Array],
+    q_park: Array,
     config: GraspConfig,
 ) -> GraspChoice | str:
     """The best grasp that is free at the part and at the nest and within the arm's reach, or why there is none.
 
-    ``solve`` turns ``T_base_tcp`` into joint angles (6,) and raises TwinError where the arm cannot reach.
+    ``solve`` turns ``T_base_tcp`` into joint angles (6,) and raises TwinError where the arm cannot reach; the arm comes
+    from ``q_park`` (6,) and goes back there.
     """
     reasons: Counter[str] = Counter()
     for grasp in grasps:
@@ -72,8 +74,8 @@ def choose_grasp(
         if not reached:
             reasons["out of the arm's reach"] += 1
             continue
-        # the hand is the same after half a turn: the wrist that turns least between part and nest, then from zero
-        turned, q_pick, q_place = min(reached, key=lambda r: abs(r[2][5] - r[1][5]) + 0.2 * abs(r[1][5]))
+        # the hand is the same after half a turn: the one that turns the wrist least from park over both and back
+        turned, q_pick, q_place = min(reached, key=lambda r: _wrist_travel(q_park, *r[1:]))
         return GraspChoice(
             grasp=grasp, T_part_tcp=turned, openings_m=(opening, release), q_pick=q_pick, q_place=q_place
         )
@@ -95,6 +97,12 @@ def _free_opening(
         if all(convex_gap(f, o) > config.neighbour_margin_m for f in fingers for o in outlines):
             return 2 * half
     return None
+
+
+def _wrist_travel(q_park: Array, q_pick: Array, q_place: Array) -> float:
+    """Longest turn in rad of the last joint on the way from park over part and nest and back to park."""
+    stops = np.array([q_park[5], q_pick[5], q_place[5], q_park[5]])
+    return float(np.abs(np.diff(stops)).max())
 
 
 def _reachable(

@@ -280,9 +280,7 @@ def test_a_frame_that_cannot_be_used_is_taken_again(brick):
 def test_a_refused_motion_ends_the_attempt_and_a_stopped_robot_the_run(brick):
     world = World(brick, PLACES[:1], tries_per_region=1)
     world.robot.refuse = True
-    with pytest.raises(MotionRefused):
-        world.run()  # not even the way back is allowed
-    assert [a.outcome for a in world.controller.attempts] == ["ik"]
+    assert [(a.outcome, a.tried) for a in world.run()] == [("ik", True), ("grasp", False)]
     stopped = World(brick, PLACES[:1])
     stopped.robot.stuck = True
     with pytest.raises(RobotError, match="protective stop"):

@@ -159,7 +159,11 @@ def choose(brick, neighbours=(), nest_neighbours=(), solve=lambda T: np.zeros(6)
     if not (brick.folder / "grasps.json").exists():
         write_grasps(brick)
     grasps = read_grasps(brick)[0]
-    return target, others, choose_grasp(target, others, NEST @ resting, in_tray, grasps, solve, GraspConfig())
+    return (
+        target,
+        others,
+        choose_grasp(target, others, NEST @ resting, in_tray, grasps, solve, np.zeros(6), GraspConfig()),
+    )
 
 
 def fingers_hit(target, choice, others):
