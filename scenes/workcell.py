@@ -24,6 +24,8 @@ __all__ = ["CellConfig", "TrayConfig", "build_arm", "build_board_scene", "build_
 OVERVIEW = "overview"
 """Camera that sees the whole cell from the side."""
 OVERVIEW_INTRINSICS = Intrinsics(width=1600, height=1200, fx=1500.0, fy=1500.0, cx=799.5, cy=599.5)
+SHADOWLESS = ("table", "stand", "camera_body")
+"""Bodies whose shadows would miss the board and be cut off at the edge of the shadow map."""
 SHADOW_SIZE = 4096
 SHADOW_HALF_M = 0.22
 """The shadow map covers this far from the board's centre: 0.11 mm a texel, finer than two camera pixels."""
@@ -209,7 +211,7 @@ def _add_cell_visuals(spec: mujoco.MjSpec, config: CellConfig) -> None:
         if entry is not nest:
             body = spec.worldbody if entry["body"] == "table" else spec.body(entry["body"])
             drawn = add_visual(body, name, name, material=name)
-            drawn.castshadow = entry["body"] != "table"
+            drawn.castshadow = entry["body"] not in SHADOWLESS
     outline = f"cell_{nest['file'].removesuffix('.stl')}"
     for part in config.tray.classes:
         for k, T_tray_nest in enumerate(config.tray.nests(part)):
