@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from cad.parts import hash_file, load_part
+from cad.parts import Part, hash_file, load_part
 from perception.estimates import PoseEstimator
 from twin.doctor import versions
 from twin.pick_config import PickConfig
@@ -45,6 +45,7 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
     card = build_scorecard(
         results,
         config=config_json(config),
+        views_differ=all(_views_differ(load_part(name)) for name in config.parts),
         seed=config.seed,
         versions=versions(),
         weights=weights,
@@ -116,6 +117,10 @@ def _run_scenes(config: PickConfig) -> Iterator[SceneResult]:
             process.terminate()
         pool.shutdown(cancel_futures=True)
         raise
+
+
+def _views_differ(part: Part) -> bool:
+    return len({p.view_class for p in part.stable_poses}) == len(part.stable_poses)
 
 
 def _check_writable(out: Path) -> None:

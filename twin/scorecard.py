@@ -93,8 +93,14 @@ def pose_error_table(errors: Sequence[tuple[str, PoseError]]) -> dict[str, Any]:
     return table
 
 
-def build_scorecard(scenes: Sequence[SceneResult], *, config: dict[str, Any], **about: Any) -> dict[str, Any]:
-    """The scorecard as a JSON-ready dictionary; ``about`` adds seed, versions, weights."""
+def build_scorecard(
+    scenes: Sequence[SceneResult], *, config: dict[str, Any], views_differ: bool = True, **about: Any
+) -> dict[str, Any]:
+    """The scorecard as a JSON-ready dictionary; ``about`` adds seed, versions, weights.
+
+    ``views_differ`` says that no two placements of any part look the same from above (its view classes); then the errors
+    modulo view equivalence are the strict ones. Otherwise they are left out.
+    """
     parts = [p for s in scenes for p in s.parts]
     succeeded = sum(p.succeeded for p in parts)
     cycles = summarise(c for s in scenes for c in s.cycle_s)
@@ -113,6 +119,7 @@ def build_scorecard(scenes: Sequence[SceneResult], *, config: dict[str, Any], **
         },
         "failures": {f: sum(p.failure == f for p in parts) for f in FAILURES},
         "pose_error": pose_error_table(strict),
+        "pose_error_equivalent": pose_error_table(strict) if views_differ else None,
         "pose_error_branch_right": pose_error_table([(n, e) for n, e in strict if e.branch_right]),
         "in_hand_error": {
             "all": {
