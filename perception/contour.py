@@ -46,8 +46,8 @@ class ContourConfig:
     rounds: int = 4
     inlier_px: float = 1.0
     covariance_scale: float = 4.0
-    floor_m: float = 1.2e-5
-    floor_yaw: float = float(np.radians(0.03))
+    floor_m: float = 1.6e-5
+    floor_yaw: float = float(np.radians(0.05))
     profile: ProfileConfig = field(default_factory=ProfileConfig)
 
     def __post_init__(self) -> None:
@@ -100,7 +100,7 @@ def refine(
     edges = image if isinstance(image, EdgeImage) else EdgeImage.of(image)
     camera = TableCamera(intrinsics=intrinsics, T_cam_table=T_cam_table)
     start = np.array([x, y, yaw])
-    samples = visible_edges(part, stable_pose, camera.direction(start))
+    samples = visible_edges(part, stable_pose, camera.eye(start))
     sparse = samples.every(config.stride)
     metres_per_pixel = camera.metres_per_pixel(start)
 
@@ -143,7 +143,9 @@ def _grid(
         scores[i] = response.reshape(len(shifts), len(shifts))
     peaks = np.argwhere(scores == maximum_filter(scores, size=3))
     peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")][: config.starts]
-    return [camera.shifted(pose, shifts[j], shifts[k]) + np.array([0.0, 0.0, yaws[i]]) for i, j, k in peaks]
+    return [
+        camera.shifted(pose, float(shifts[j]), float(shifts[k])) + np.array([0.0, 0.0, yaws[i]]) for i, j, k in peaks
+    ]
 
 
 def _follow_edges(

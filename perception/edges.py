@@ -4,8 +4,7 @@ An outline is where the part ends and the background begins. Inner edges are whe
 the surface turns by more than 20 degrees, from one side to the other (the chords of a rounded bend turn by less and
 show no edge); they count for less, since their contrast is uncertain. Both sides are compared a pixel away from the
 edge, so that relief too fine to be seen is left out. Samples are in frame ``rest``: the table frame of the part at
-x = y = yaw = 0, that is ``T_table_part`` applied. What is visible depends on the direction to the camera alone, so sets
-are kept per part, stable pose and direction.
+x = y = yaw = 0, that is ``T_table_part`` applied.
 """
 
 from __future__ import annotations
@@ -25,17 +24,20 @@ SAMPLE_STEP_M = 1.2e-4
 OUTLINE_WEIGHT = 1.0
 INNER_WEIGHT = 0.35
 
-PATCH_OFFSETS_M: Array = np.linspace(-4.32e-4, 4.32e-4, 49, dtype=np.float64)
-"""Distances from an edge, along its normal, at which ``EdgeSamples.patches`` says what is seen."""
+PATCH_OFFSETS_M: Array = np.linspace(-4.32e-4, 4.32e-4, 48, dtype=np.float64)
+"""Distances from an edge, along its normal, at which ``EdgeSamples.patches`` says what is seen. Their number is even:
+the edge itself lies half-way between two of them."""
 MAX_PATCHES = 6
 
-_PIXEL_M = 3e-5  # of the orthographic map that samples are compared with
-_DIRECTION_STEP = 0.02  # rad; directions to the camera are rounded to this
+_PIXEL_M = 3e-5  # of the map that samples are compared with
+_DIRECTION_STEP = 0.004  # rad; directions to the camera are rounded to this: 3 mm of height move by 6 um at most
+_DISTANCE_STEP_M = 0.02  # and distances to this
 _GRAZING = 0.02  # sine of the angle under which a face counts as seen edge-on
 _LIFT_M = 5e-5  # a sample is hidden when something lies nearer than this in front of it
 _BESIDE_M = 8e-5  # where the two sides of an edge are compared: a little over a pixel of the camera
 _STEP_M = 1e-4  # a smaller step in depth is a relief that does not show
 _MARGIN = 16  # pixels of background kept round the part
+_SKEW = 0.47  # rad; edges of a part at rest run along its axes, and so cross the map's rows and columns at all phases
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +46,8 @@ class EdgeSamples:
 
     ``points`` (N, 3) m, ``tangents`` (N, 3) unit, ``weights`` (N,) 1 on outlines and less on inner edges, ``outline``
     (N,) bool. ``patches`` (N, T) numbers the pieces of surface or background seen along the normal at
-    ``PATCH_OFFSETS_M``, from 0 to MAX_PATCHES - 1; the normal is tangent x direction to the camera.
+    ``PATCH_OFFSETS_M``, from 0 to MAX_PATCHES - 1; the normal is tangent x direction to the eye, and the
+    offsets are on the plane across the line of sight through the origin of ``rest``.
     """
 
     points: Array
@@ -64,34 +67,38 @@ class EdgeSamples:
         )
 
 
-def visible_edges(part: Part, stable_pose: int, direction: Array) -> EdgeSamples:
-    """Edges of a part at rest seen from far away along ``direction`` (3,), a vector in ``rest`` from part to camera.
+def visible_edges(part: Part, stable_pose: int, eye: Array) -> EdgeSamples:
+    """Edges of a part at rest seen by a camera at ``eye`` (3,), metres in frame ``rest``.
 
-    The direction is rounded to about a degree. Raises IndexError for a stable pose the part does not have and
-    ValueError for a camera that is not above the table.
+    The eye's direction and distance are rounded a little, and sets are kept for what they round to. Raises IndexError
+    for a stable pose the part does not have and ValueError for a camera that is not above the table.
     """
     if not 0 <= stable_pose < len(part.stable_poses):
         raise IndexError(f"part {part.name!r} has {len(part.stable_poses)} stable poses; {stable_pose} is not one")
-    if direction[2] <= 0:
-        raise ValueError(f"direction {np.round(direction, 3)} points below the table; the camera must be above it")
-    slope = np.round(np.asarray(direction[:2]) / direction[2] / _DIRECTION_STEP).astype(int)
-    return _edges_from(part, stable_pose, int(slope[0]), int(slope[1]))
+    if eye[2] <= 0:
+        raise ValueError(f"an eye at {np.round(eye, 3)} m is below the table; the camera must be above it")
+    slope = np.round(np.asarray(eye[:2]) / eye[2] / _DIRECTION_STEP).astype(int)
+    distance = max(1, round(float(np.linalg.norm(eye)) / _DISTANCE_STEP_M))
+    return _edges_from(part, stable_pose, int(slope[0]), int(slope[1]), distance)
 
 
 @lru_cache(maxsize=1024)
-def _edges_from(part: Part, stable_pose: int, slope_x: int, slope_y: int) -> EdgeSamples:
+def _edges_from(part: Part, stable_pose: int, slope_x: int, slope_y: int, distance: int) -> EdgeSamples:
     towards = np.array([slope_x * _DIRECTION_STEP, slope_y * _DIRECTION_STEP, 1.0])
     towards /= np.linalg.norm(towards)
+    eye = towards * distance * _DISTANCE_STEP_M
     solid, T_rest_part = solid_of(part), part.stable_poses[stable_pose].T_table_part
-    facing = solid.normals @ (T_rest_part[:3, :3].T @ towards)  # (F,) cosine between normal and view
+    vertices, normals = apply(T_rest_part, solid.vertices), solid.normals @ T_rest_part[:3, :3].T
+    sight = eye - vertices[solid.faces[:, 0]]
+    facing = (normals * sight).sum(axis=1) / np.linalg.norm(sight, axis=1)  # (F,) cosine between normal and sight
     a, b = facing[solid.edge_faces].T
     limb = np.minimum(a, b) * np.maximum(a, b) < 0
     crease = (np.minimum(a, b) > _GRAZING) & (solid.edge_angle > CREASE_ANGLE)
     chosen = np.flatnonzero(limb | crease)
 
     edge, points, tangents = _sample(apply(T_rest_part, solid.edge_ends[chosen]))
-    outward = solid.normals[solid.edge_faces[chosen[edge]]].sum(axis=1) @ T_rest_part[:3, :3].T
-    view = _ViewMap.of(solid, T_rest_part, facing, towards)
+    outward = normals[solid.edge_faces[chosen[edge]]].sum(axis=1)
+    view = _ViewMap.of(solid, vertices, normals, facing, eye)
     seen = ~view.hidden(points, outward)
     points, tangents = points[seen], tangents[seen]
     outline, inner = view.sides(points, tangents)
@@ -120,36 +127,49 @@ def _sample(ends: Array) -> tuple[NDArray[np.int64], Array, Array]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ViewMap:
-    """A resting part drawn orthographically along a direction: nearness (m), normal and facet of the face seen."""
+    """A resting part as an eye sees it, on the plane through frame ``rest``'s origin across the line of sight.
 
-    basis: Array  # (3, 3), rows: image right, image up, nearness
+    ``height`` (m) of the surface seen towards the eye, minus infinity off the part; its normal and facet.
+    """
+
+    basis: Array  # (3, 3), rows: right, up, towards the eye
+    distance: float
     low: Array
-    nearness: Array
+    height: Array
     normals: Array
     facet: NDArray[np.int32]
 
     @staticmethod
-    def of(solid: Solid, T_rest_part: Array, facing: Array, towards: Array) -> _ViewMap:
-        right = np.cross([0.0, 1.0, 0.0], towards)
+    def of(solid: Solid, vertices: Array, normals: Array, facing: Array, eye: Array) -> _ViewMap:
+        distance = float(np.linalg.norm(eye))
+        towards = eye / distance
+        right = np.cross([-np.sin(_SKEW), np.cos(_SKEW), 0.0], towards)
         right /= np.linalg.norm(right)
         basis = np.stack([right, np.cross(towards, right), towards])
-        p_view = apply(T_rest_part, solid.vertices) @ basis.T
-        low = p_view[:, :2].min(axis=0) - _MARGIN * _PIXEL_M
-        size = np.ceil((p_view[:, :2].max(axis=0) - low) / _PIXEL_M).astype(int) + _MARGIN + 1
+        p_view = vertices @ basis.T
+        on_plane = p_view[:, :2] * (distance / (distance - p_view[:, 2:]))
+        low = on_plane.min(axis=0) - _MARGIN * _PIXEL_M
+        size = np.ceil((on_plane.max(axis=0) - low) / _PIXEL_M).astype(int) + _MARGIN + 1
         front = np.flatnonzero(facing > 0)
-        uv = (p_view[:, :2] - low) / _PIXEL_M
-        nearness, face = rasterise(uv, p_view[:, 2], solid.faces[front], int(size[0]), int(size[1]))
+        nearness = 1.0 / (distance - p_view[:, 2])
+        seen, face = rasterise((on_plane - low) / _PIXEL_M, nearness, solid.faces[front], int(size[0]), int(size[1]))
         on_part = face >= 0
         return _ViewMap(
             basis=basis,
+            distance=distance,
             low=low,
-            nearness=nearness,
-            normals=np.where(on_part[..., None], solid.normals[front[face]] @ T_rest_part[:3, :3].T, 0.0),
+            height=np.where(on_part, distance - 1.0 / np.where(on_part, seen, 1.0), -np.inf),
+            normals=np.where(on_part[..., None], normals[front[face]], 0.0),
             facet=np.where(on_part, solid.facet[front[face]], np.int32(-1)),
         )
 
+    def _seen_at(self, points: Array) -> tuple[Array, Array]:
+        """Where points (N, 3) appear on the plane (N, 2), and their heights towards the eye (N,)."""
+        q = points @ self.basis.T
+        return q[:, :2] * (self.distance / (self.distance - q[:, 2:])), q[:, 2]
+
     def _cell(self, q: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and column of view coordinates (..., 2) in metres, those outside moved to the border."""
+        """Row and column of places (..., 2) m on the plane, those outside moved to the border."""
         cell = np.round((q - self.low) / _PIXEL_M).astype(int)
         height, width = self.facet.shape
         return np.clip(cell[..., 1], 0, height - 1), np.clip(cell[..., 0], 0, width - 1)
@@ -159,35 +179,35 @@ class _ViewMap:
 
         A point is moved a pixel along ``outward`` (N, 3), away from the faces it joins, before depths are compared.
         """
-        q = points @ self.basis.T
+        place, height = self._seen_at(points)
         aside = outward @ self.basis[:2].T
         norm = np.linalg.norm(aside, axis=1, keepdims=True)
-        moved = q[:, :2] + np.where(norm > 0.05, aside / np.maximum(norm, 1e-9), 0.0) * _PIXEL_M
-        return self.nearness[self._cell(moved)] > q[:, 2] + _LIFT_M
+        moved = place + np.where(norm > 0.05, aside / np.maximum(norm, 1e-9), 0.0) * _PIXEL_M
+        return self.height[self._cell(moved)] > height + _LIFT_M
 
-    def _normals(self, tangents: Array) -> Array:
-        """Unit normals (N, 2) of edges in the view: tangent x direction to the camera."""
-        along = tangents @ self.basis[:2].T
+    def _normals(self, points: Array, tangents: Array) -> Array:
+        """Unit normals (N, 2) of edges on the plane: tangent x direction to the eye."""
+        along = self._seen_at(points + 1e-6 * tangents)[0] - self._seen_at(points)[0]
         length = np.linalg.norm(along, axis=1, keepdims=True)
-        return np.stack([along[:, 1], -along[:, 0]], axis=1) / np.maximum(length, 1e-9)
+        return np.stack([along[:, 1], -along[:, 0]], axis=1) / np.maximum(length, 1e-12)
 
     def sides(self, points: Array, tangents: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which edge samples lie between part and background, and which show inside of the part.
 
         The latter are where depth steps, or the normal turns, from one side of the edge to the other.
         """
-        q, aside = points @ self.basis[:2].T, self._normals(tangents) * _BESIDE_M
-        left, right = self._cell(q + aside), self._cell(q - aside)
-        on_left, on_right = np.isfinite(self.nearness[left]), np.isfinite(self.nearness[right])
+        place, aside = self._seen_at(points)[0], self._normals(points, tangents) * _BESIDE_M
+        left, right = self._cell(place + aside), self._cell(place - aside)
+        on_left, on_right = np.isfinite(self.height[left]), np.isfinite(self.height[right])
         both = on_left & on_right
-        step = np.abs(np.where(both, self.nearness[left], 0.0) - np.where(both, self.nearness[right], 0.0)) > _STEP_M
+        step = np.abs(np.where(both, self.height[left], 0.0) - np.where(both, self.height[right], 0.0)) > _STEP_M
         turned = (self.normals[left] * self.normals[right]).sum(axis=1) < np.cos(CREASE_ANGLE)
         return on_left ^ on_right, both & (step | turned)
 
     def patches(self, points: Array, tangents: Array) -> NDArray[np.uint8]:
         """What is seen beside each sample, (N, T); where there are too many patches the outer ones are merged."""
-        q, aside = points @ self.basis[:2].T, self._normals(tangents)
-        label = self.facet[self._cell(q[:, None] + PATCH_OFFSETS_M[:, None] * aside[:, None])]
+        place, aside = self._seen_at(points)[0], self._normals(points, tangents)
+        label = self.facet[self._cell(place[:, None] + PATCH_OFFSETS_M[:, None] * aside[:, None])]
         change = np.zeros(label.shape, dtype=np.int64)
         change[:, 1:] = label[:, 1:] != label[:, :-1]
         number = np.cumsum(change, axis=1)

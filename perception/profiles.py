@@ -25,7 +25,7 @@ class ProfileConfig:
 
     half_length_px: float = 4.0
     step_px: float = 0.5
-    blur_px: float = 0.9
+    blur_px: float = 0.8
     reach_px: float = 1.5
     noise_levels: float = 2.0
 

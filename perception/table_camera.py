@@ -48,8 +48,8 @@ class TableCamera:
         jacobian = np.stack([(column * normals).sum(axis=1) for column in columns], axis=1)
         return pixels, normals, jacobian
 
-    def direction(self, pose: Array) -> Array:
-        """Vector (3,) in the part's frame ``rest`` from the part at ``pose`` to the camera."""
+    def eye(self, pose: Array) -> Array:
+        """Where the camera is (3,), in the frame ``rest`` of a part at ``pose``."""
         x, y, yaw = pose
         dx, dy, dz = inverse(self.T_cam_table)[:3, 3] - [x, y, 0.0]
         c, s = np.cos(yaw), np.sin(yaw)
