@@ -141,7 +141,7 @@ def losses(outputs: Outputs, targets: Targets) -> Losses:
     dice = 1 - (2 * overlap + 20) / (probability.sum((1, 2)) + mask.sum((1, 2)) + 20)
     distance = functional.smooth_l1_loss(outputs.offset_px, targets.offset_px, reduction="none").sum(1)
     return {
-        "mask": 3.0 * (cross_entropy * (1 + 2 * mask)).mean(),
+        "mask": 3.0 * (cross_entropy * (1 + mask)).mean(),
         "dice": dice.mean(),
         "offset": 0.15 * (distance * targets.foreground).sum() / (targets.foreground.sum() + 50),
         "heat": focal(outputs.heat, targets.heat),

@@ -19,7 +19,7 @@ MIN_VISIBLE_PX = 40
 
 @dataclass(frozen=True)
 class Window:
-    """One training example: image (H, W, 3), instance map (H, W), and centre (u, v) and class of each instance."""
+    """One example: image (H, W, 3), filled instance map (H, W), centre (u, v) and class of each instance."""
 
     image: NDArray[np.uint8]
     instances: NDArray[np.uint8]
@@ -27,11 +27,27 @@ class Window:
     classes: NDArray[np.int64]  # (I,)
 
 
+def filled(instances: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An instance map whose instances have no holes: what is seen through a hollow part belongs to it.
+
+    At a quarter of the camera's resolution the walls of a part that stands on end are one pixel wide; its outline is
+    what can be found.
+    """
+    out = instances.copy()
+    for k in np.unique(instances[instances > 0]):
+        contours, _ = cv2.findContours((instances == k).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        inside = np.zeros_like(instances)
+        cv2.drawContours(inside, contours, -1, (1,), cv2.FILLED)
+        out[(inside > 0) & (instances == 0)] = k
+    return out
+
+
 class Windows:
     """The training windows as examples."""
 
     def __init__(self, data: WindowSet, parts: Sequence[Part]) -> None:
         self.data = data
+        self.instances = np.stack([filled(instances) for instances in data.instance_map])
         self.labels = data.labels(parts)
 
     def __len__(self) -> int:
@@ -44,7 +60,7 @@ class Windows:
         order = rows[np.argsort(self.data.instance[rows])]
         return Window(
             image=self.data.images[index],
-            instances=self.data.instance_map[index],
+            instances=self.instances[index],
             centres=self.labels.body_px[order],
             classes=self.labels.part_index[order],
         )

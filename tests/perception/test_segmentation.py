@@ -12,7 +12,7 @@ from perception.segmentation import DecodeConfig, Outputs, SegmentationNet, Segm
 from perception.train import main
 from perception.train_segmentation import NO_CLASS, batch_of, examine, figures_of, focal, losses, targets_of
 from perception.training import seeded
-from perception.windows import Window, cut, flip, paste, recolour, warp
+from perception.windows import Window, cut, filled, flip, paste, recolour, warp
 
 SIZE = 128
 
@@ -124,6 +124,16 @@ def test_a_cut_keeps_pixels_and_centres_together(seed: int) -> None:
     np.testing.assert_array_equal(part.instances, window.instances[dv : dv + 64, du : du + 64])
     with pytest.raises(ValueError, match="cannot cut 200"):
         cut(window, 200, rng)
+
+
+def test_what_is_seen_through_a_part_belongs_to_it_unless_it_is_another_part() -> None:
+    instances = np.zeros((20, 20), np.uint8)
+    instances[2:12, 2:12] = 2
+    instances[4:10, 4:10] = 0
+    instances[6, 6] = 1
+    out = filled(instances)
+    assert out[6, 6] == 1 and np.count_nonzero(out == 2) == 99 and not out[12:].any()
+    np.testing.assert_array_equal(filled(out), out)
 
 
 def test_normalisation_ignores_exposure() -> None:
