@@ -30,7 +30,7 @@ class ControllerConfig:
     """The part's lowest point above the nest when it is let go."""
     joint_speed: float = 2.4
     joint_acceleration: float = 8.0
-    carry_speed: float = 0.9
+    carry_speed: float = 1.6
     carry_acceleration: float = 2.5
     carry_min_s: float = 1.1
     """A carry takes at least this long."""
