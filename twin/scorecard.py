@@ -98,8 +98,8 @@ def build_scorecard(
 ) -> dict[str, Any]:
     """The scorecard as a JSON-ready dictionary; ``about`` adds seed, versions, weights.
 
-    ``views_differ`` says that no two placements of any part look the same from above (its view classes); then the errors
-    modulo view equivalence are the strict ones. Otherwise they are left out.
+    ``views_differ`` says that no two placements of any part look the same from above (its view classes); the errors
+    modulo view equivalence are then the strict ones, and otherwise left out.
     """
     parts = [p for s in scenes for p in s.parts]
     succeeded = sum(p.succeeded for p in parts)
