@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cad.spatial import Array
@@ -63,7 +64,7 @@ class ChoiceWeights:
     def load(path: Path) -> ChoiceWeights:
         """Read a JSON file; raises PerceptionError when there is none or it does not fit this version."""
         if not path.exists():
-            raise PerceptionError(f"no choice weights at {path}; fit them with `tagcell train`")
+            raise PerceptionError(f"no choice weights at {path}; fit them with `python -m perception.train choice`")
         try:
             return ChoiceWeights(**json.loads(path.read_text()))
         except (TypeError, ValueError) as error:
@@ -104,7 +105,9 @@ def gate_evidence(scores: Array, evidence: Array, best: int, not_a_part: float) 
     )
 
 
-def fit_choice_weights(evidence: Sequence[Array], right: Sequence[Array], penalty: float = 3e-3) -> dict[str, float]:
+def fit_choice_weights(
+    evidence: Sequence[Array], right: Sequence[NDArray[np.bool_]], penalty: float = 3e-3
+) -> dict[str, float]:
     """Weights of the choice by listwise logistic regression.
 
     ``evidence`` holds for every crop (H, len(FEATURES)), ``right`` (H,) bool; crops with one hypothesis, or none that
@@ -133,7 +136,7 @@ def fit_choice_weights(evidence: Sequence[Array], right: Sequence[Array], penalt
     return dict(zip(FEATURES, (found.x / spread).tolist(), strict=True))
 
 
-def fit_gate(evidence: Array, right: Array, penalty: float = 1e-3) -> dict[str, float]:
+def fit_gate(evidence: Array, right: NDArray[np.bool_], penalty: float = 1e-3) -> dict[str, float]:
     """Weights of the gate by logistic regression on winners with evidence (N, len(GATE_FEATURES)), right (N,) bool."""
     spread = np.maximum(evidence.std(axis=0), 1e-6)
     spread[0] = 1.0
@@ -150,7 +153,7 @@ def fit_gate(evidence: Array, right: Array, penalty: float = 1e-3) -> dict[str, 
     return dict(zip(GATE_FEATURES, (found.x / spread).tolist(), strict=True))
 
 
-def threshold_for(probability: Array, right: Array, wanted: float) -> float:
+def threshold_for(probability: Array, right: NDArray[np.bool_], wanted: float) -> float:
     """Smallest threshold on ``probability`` (N,) above which a share ``wanted`` of the accepted are right.
 
     Where no threshold reaches it, that of the highest share.

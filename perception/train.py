@@ -24,6 +24,7 @@ TRAINERS: dict[str, str] = {
     "classifier": "perception.train_crops:train_classifier",
     "verifier": "perception.train_crops:train_verifier",
     "keypoints": "perception.train_crops:train_keypoints",
+    "choice": "perception.fit_choice:fit_choice",
 }
 """Network name -> "module:function"; the function takes its config as ``config``, which tyro reads."""
 

@@ -26,7 +26,7 @@ from scenes.shots import CROP_DOWNSCALE, CROP_SIZE, WINDOW_SIZE, Shot, ShotRange
 from scenes.stage import Stage, StageConfig
 from scenes.textures import make_textures
 
-Kind = Literal["crop", "scene"]
+Kind = Literal["crop", "fine", "scene"]
 Split = Literal["train", "val"]
 MANIFEST = "dataset.json"
 RASTERISER_THREADS = "LP_NUM_THREADS"
@@ -40,6 +40,9 @@ STAGES: dict[str, StageConfig] = {
     "crop": StageConfig(
         slots=4, max_size=CROP_SIZE // CROP_DOWNSCALE + 2 * FULL_MARGIN_PX, shadow_half_m=0.025, shadow_size=512
     ),
+    "fine": StageConfig(
+        slots=4, max_size=CROP_SIZE + 2 * CROP_DOWNSCALE * FULL_MARGIN_PX, shadow_half_m=0.025, shadow_size=1024
+    ),
     "scene": StageConfig(slots=8, max_size=WINDOW_SIZE + 2 * FULL_MARGIN_PX, shadow_half_m=0.07, shadow_size=1024),
 }
 
@@ -48,7 +51,8 @@ STAGES: dict[str, StageConfig] = {
 class DatasetConfig:
     """What to generate. Everything but ``jobs`` decides the images; the same settings give the same bytes.
 
-    ``kind``: ``crop`` for 128 x 128 crops round one part, ``scene`` for 320 x 320 windows of the quarter-size frame.
+    ``kind``: ``crop`` for 128 x 128 crops round one part, ``fine`` for the same at full resolution, 256 x 256, and
+    ``scene`` for 320 x 320 windows of the quarter-size frame.
     """
 
     kind: Kind = "crop"
@@ -176,7 +180,10 @@ class ChunkMaker:
         self._stage.close()
 
     def _add_image(self, writer: ChunkWriter, rng: np.random.Generator) -> None:
-        shot = self._sampler.crop(rng) if self._config.kind == "crop" else self._sampler.window(rng)
+        if self._config.kind == "scene":
+            shot = self._sampler.window(rng)
+        else:
+            shot = self._sampler.crop(rng, CROP_DOWNSCALE if self._config.kind == "crop" else 1)
         instances = self._stage.arrange(shot)
         look = draw_look(self._config.look, TEXTURES, rng)
         self._stage.dress(shot, look, self._config.look, rng)
@@ -192,7 +199,12 @@ class ChunkMaker:
         """One for each part seen, in the shot's order; whole silhouettes come from a wider window if need be."""
         masks = [seen == instance for instance in instances]
         border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
-        wide = self._stage.render(_widened(shot.intrinsics), ("instances",)).instances if (border >= 0).any() else None
+        margin = FULL_MARGIN_PX * (CROP_DOWNSCALE if self._config.kind == "fine" else 1)
+        wide = (
+            self._stage.render(_widened(shot.intrinsics, margin), ("instances",)).instances
+            if (border >= 0).any()
+            else None
+        )
         T_cam_board = inverse(shot.T_board_cam)
         annotations = []
         for placed, instance, mask in zip(shot.parts, instances, masks, strict=True):
@@ -200,7 +212,7 @@ class ChunkMaker:
                 continue
             full = mask if wide is None else wide == instance
             x, y, w, h = annotation_box(full)
-            shift = 0 if wide is None else FULL_MARGIN_PX
+            shift = 0 if wide is None else margin
             annotations.append(
                 Annotation(
                     obj_id=self._parts[placed.name].obj_id,
@@ -214,6 +226,5 @@ class ChunkMaker:
         return annotations
 
 
-def _widened(intrinsics: Intrinsics) -> Intrinsics:
-    side = 2 * FULL_MARGIN_PX
-    return intrinsics.crop(-FULL_MARGIN_PX, -FULL_MARGIN_PX, intrinsics.width + side, intrinsics.height + side)
+def _widened(intrinsics: Intrinsics, margin: int) -> Intrinsics:
+    return intrinsics.crop(-margin, -margin, intrinsics.width + 2 * margin, intrinsics.height + 2 * margin)

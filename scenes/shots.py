@@ -81,8 +81,8 @@ class ShotSampler:
             (part.name, pose.index): footprint_radius(part, pose) for part in parts for pose in part.stable_poses
         }
 
-    def crop(self, rng: np.random.Generator) -> Shot:
-        """A 256 x 256 window, rendered at half resolution, round a part (entry 0 of ``parts``) or round none."""
+    def crop(self, rng: np.random.Generator, downscale: int = CROP_DOWNSCALE) -> Shot:
+        """A 256 x 256 window, ``downscale`` times smaller, round a part (entry 0 of ``parts``) or round none."""
         ranges = self._ranges
         T_board_cam = draw_camera(ranges.view, rng)
         taken: list[tuple[float, float, float]] = []
@@ -104,8 +104,8 @@ class ShotSampler:
         corner = np.round([u, v]).astype(int) + jitter - CROP_SIZE // 2
         window = BASLER.crop(int(corner[0]), int(corner[1]), CROP_SIZE, CROP_SIZE)
         return Shot(
-            intrinsics=window.downscaled(CROP_DOWNSCALE),
-            downscale=CROP_DOWNSCALE,
+            intrinsics=window.downscaled(downscale),
+            downscale=downscale,
             T_board_cam=T_board_cam,
             focus_board=(float(x), float(y)),
             parts=tuple(parts),

@@ -49,8 +49,8 @@ class Pick(PickConfig):
 class Render:
     """Render a labelled data set in BOP layout: crops of single parts, or windows of whole scenes."""
 
-    kind: Literal["crop", "scene"] = "crop"
-    """Crops of one part each, or windows of scenes with many parts."""
+    kind: Literal["crop", "fine", "scene"] = "crop"
+    """Crops of one part each at half resolution or (fine) at full resolution, or windows of scenes with many parts."""
     split: Literal["train", "val"] = "train"
     """Which board textures, lights and camera heights to draw from."""
     count: int = 1000

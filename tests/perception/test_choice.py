@@ -79,7 +79,7 @@ def test_weights_round_trip(tmp_path: Path) -> None:
 
 
 def test_missing_and_unfit_weights_are_errors(tmp_path: Path) -> None:
-    with pytest.raises(PerceptionError, match="tagcell train"):
+    with pytest.raises(PerceptionError, match=r"perception\.train choice"):
         ChoiceWeights.load(tmp_path / "none.json")
     (tmp_path / "odd.json").write_text('{"weights": 1}')
     with pytest.raises(PerceptionError, match="fit them again"):
