@@ -165,7 +165,7 @@ def test_a_folder_with_other_data_is_refused(crops, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"kind": "movie"}, "is not one of crop, scene"),
+        ({"kind": "movie"}, "is not one of crop, fine, scene"),
         ({"split": "test"}, "is not one of train, val"),
         ({"count": 0}, "count 0"),
         ({"chunk": 2000}, "at most 1000"),
