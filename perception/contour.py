@@ -43,7 +43,7 @@ class ContourConfig:
     scan_px: float = 4.0
     candidates: int = 4
     stride: int = 4
-    rounds: int = 4
+    rounds: int = 3
     inlier_px: float = 1.0
     covariance_scale: float = 4.0
     floor_m: float = 1.6e-5
@@ -106,7 +106,8 @@ def refine(
 
     near = [_follow_edges(edges, camera, sparse, at, config) for at in _grid(edges, camera, sparse, start, config)]
     rough = ProfileModel(sparse, camera, metres_per_pixel, config.profile)
-    pool = [scanned for pose in near for scanned in _scan(edges, rough, pose, config)]
+    rougher = ProfileModel(sparse.every(2), camera, metres_per_pixel, config.profile)
+    pool = [scanned for pose in near for scanned in _scan(edges, rougher, pose, config)]
     best = sorted(pool, key=lambda scored: -scored[0])[: config.candidates]
     fits = [rough.fit(edges.gray, pose, config.rounds) for _, pose in best]
     pose = max(fits, key=lambda fit: fit.explained).pose

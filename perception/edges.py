@@ -29,14 +29,14 @@ PATCH_OFFSETS_M: Array = np.linspace(-4.32e-4, 4.32e-4, 48, dtype=np.float64)
 the edge itself lies half-way between two of them."""
 MAX_PATCHES = 6
 
-_PIXEL_M = 3e-5  # of the map that samples are compared with
+_PIXEL_M = 4e-5  # of the map that samples are compared with
 _DIRECTION_STEP = 0.004  # rad; directions to the camera are rounded to this: 3 mm of height move by 6 um at most
 _DISTANCE_STEP_M = 0.02  # and distances to this
 _GRAZING = 0.02  # sine of the angle under which a face counts as seen edge-on
 _LIFT_M = 5e-5  # a sample is hidden when something lies nearer than this in front of it
 _BESIDE_M = 8e-5  # where the two sides of an edge are compared: a little over a pixel of the camera
 _STEP_M = 1e-4  # a smaller step in depth is a relief that does not show
-_MARGIN = 16  # pixels of background kept round the part
+_MARGIN = 12  # pixels of background kept round the part
 _SKEW = 0.47  # rad; edges of a part at rest run along its axes, and so cross the map's rows and columns at all phases
 
 
@@ -129,15 +129,17 @@ def _sample(ends: Array) -> tuple[NDArray[np.int64], Array, Array]:
 class _ViewMap:
     """A resting part as an eye sees it, on the plane through frame ``rest``'s origin across the line of sight.
 
-    ``height`` (m) of the surface seen towards the eye, minus infinity off the part; its normal and facet.
+    ``height`` (m) of the surface seen towards the eye, minus infinity off the part; ``face`` seen, -1 off the part;
+    ``normals`` (F + 1, 3) and ``facets`` (F + 1,) of the faces, the last row for no face.
     """
 
     basis: Array  # (3, 3), rows: right, up, towards the eye
     distance: float
     low: Array
     height: Array
+    face: NDArray[np.int64]
     normals: Array
-    facet: NDArray[np.int32]
+    facets: NDArray[np.int32]
 
     @staticmethod
     def of(solid: Solid, vertices: Array, normals: Array, facing: Array, eye: Array) -> _ViewMap:
@@ -153,14 +155,16 @@ class _ViewMap:
         front = np.flatnonzero(facing > 0)
         nearness = 1.0 / (distance - p_view[:, 2])
         seen, face = rasterise((on_plane - low) / _PIXEL_M, nearness, solid.faces[front], int(size[0]), int(size[1]))
-        on_part = face >= 0
+        with np.errstate(divide="ignore"):
+            height = distance - 1.0 / np.maximum(seen, 0.0)  # minus infinity where nothing is seen
         return _ViewMap(
             basis=basis,
             distance=distance,
             low=low,
-            height=np.where(on_part, distance - 1.0 / np.where(on_part, seen, 1.0), -np.inf),
-            normals=np.where(on_part[..., None], normals[front[face]], 0.0),
-            facet=np.where(on_part, solid.facet[front[face]], np.int32(-1)),
+            height=height,
+            face=np.where(face >= 0, front[face], -1),
+            normals=np.concatenate([normals, np.zeros((1, 3))]),
+            facets=np.append(solid.facet, np.int32(-1)),
         )
 
     def _seen_at(self, points: Array) -> tuple[Array, Array]:
@@ -171,7 +175,7 @@ class _ViewMap:
     def _cell(self, q: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Row and column of places (..., 2) m on the plane, those outside moved to the border."""
         cell = np.round((q - self.low) / _PIXEL_M).astype(int)
-        height, width = self.facet.shape
+        height, width = self.face.shape
         return np.clip(cell[..., 1], 0, height - 1), np.clip(cell[..., 0], 0, width - 1)
 
     def hidden(self, points: Array, outward: Array) -> NDArray[np.bool_]:
@@ -201,13 +205,13 @@ class _ViewMap:
         on_left, on_right = np.isfinite(self.height[left]), np.isfinite(self.height[right])
         both = on_left & on_right
         step = np.abs(np.where(both, self.height[left], 0.0) - np.where(both, self.height[right], 0.0)) > _STEP_M
-        turned = (self.normals[left] * self.normals[right]).sum(axis=1) < np.cos(CREASE_ANGLE)
-        return on_left ^ on_right, both & (step | turned)
+        cosine = (self.normals[self.face[left]] * self.normals[self.face[right]]).sum(axis=1)
+        return on_left ^ on_right, both & (step | (cosine < np.cos(CREASE_ANGLE)))
 
     def patches(self, points: Array, tangents: Array) -> NDArray[np.uint8]:
         """What is seen beside each sample, (N, T); where there are too many patches the outer ones are merged."""
         place, aside = self._seen_at(points)[0], self._normals(points, tangents)
-        label = self.facet[self._cell(place[:, None] + PATCH_OFFSETS_M[:, None] * aside[:, None])]
+        label = self.facets[self.face[self._cell(place[:, None] + PATCH_OFFSETS_M[:, None] * aside[:, None])]]
         change = np.zeros(label.shape, dtype=np.int64)
         change[:, 1:] = label[:, 1:] != label[:, :-1]
         number = np.cumsum(change, axis=1)

@@ -60,11 +60,15 @@ class ProfileModel:
         away = (self._offsets_px[:, None] - PATCH_OFFSETS_M / metres_per_pixel) / c.blur_px  # (S, T)
         kernel = np.exp(-0.5 * away**2)
         kernel /= kernel.sum(axis=1, keepdims=True)
-        one_hot = (samples.patches[..., None] == np.arange(MAX_PATCHES)).astype(np.float64)  # (N, T, M)
-        self._basis = np.matmul(kernel, one_hot)  # (N, S, M)
-        self._slope = np.matmul(-kernel * away / c.blur_px, one_hot)
-        transposed = self._basis.transpose(0, 2, 1)
-        self._solver = np.linalg.solve(transposed @ self._basis + 1e-3 * np.eye(MAX_PATCHES), transposed)  # (N, M, S)
+        one_hot = (samples.patches[..., None] == np.arange(MAX_PATCHES)).astype(np.float32)  # (N, T, M)
+        both = np.matmul(np.concatenate([kernel, -kernel * away / c.blur_px]).astype(np.float32), one_hot)
+        basis, slope = both[:, : len(kernel)], both[:, len(kernel) :]  # (N, S, M), and its derivative by the offset
+        transposed = basis.transpose(0, 2, 1)
+        solver = np.linalg.solve(transposed @ basis + 1e-3 * np.eye(MAX_PATCHES, dtype=np.float32), transposed)
+        # From a profile to what its patches leave unexplained, and to how it would change if the edge moved by a
+        # pixel, less what a change of the patches' brightness can imitate: (N, S, S) each.
+        self._unexplained = np.eye(len(kernel), dtype=np.float32) - basis @ solver
+        self._moved = -self._unexplained @ (slope @ solver)
 
     def explained_at(self, image: Image32, pose: Array, shifts_px: Array) -> Array:
         """What share in [0, 1] of the brightness variance the model explains at ``pose`` shifted by (P, 2) pixels."""
@@ -75,8 +79,7 @@ class ProfileModel:
         seen = cv2.remap(image, moved, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyright: ignore[reportCallIssue, reportArgumentType]
         seen = seen.reshape(n_shifts, n_samples, length).transpose(1, 2, 0)  # (N, S, P)
         seen = seen - seen.mean(axis=1, keepdims=True)
-        keep = (np.eye(length) - np.matmul(self._basis, self._solver)).astype(np.float32)
-        return self._explained(seen, np.matmul(keep, seen), normals)
+        return self._explained(seen, self._unexplained @ seen, normals)
 
     def fit(self, image: Image32, pose: Array, rounds: int) -> ProfileFit:
         """Move ``pose`` (x, y, yaw), right within about a pixel, so that the model matches a gray image (H, W)."""
@@ -86,10 +89,8 @@ class ProfileModel:
         for _ in range(rounds):
             pixels, normals, jacobian = self.camera.project(self.samples, pose)
             seen = self._read(image, pixels, normals)
-            brightness = np.matmul(self._solver, seen[..., None])
-            residual = seen - np.matmul(self._basis, brightness)[..., 0]
-            moved = -np.matmul(self._slope, brightness)
-            moved = (moved - np.matmul(self._basis, np.matmul(self._solver, moved)))[..., 0]
+            residual = np.einsum("nst,nt->ns", self._unexplained, seen)
+            moved = np.einsum("nst,nt->ns", self._moved, seen)
             power, pull = (moved**2).sum(axis=1), (moved * residual).sum(axis=1)
             far = np.clip(1 - (pull / (power + 1e-9) / self.config.reach_px) ** 2, 0.0, 1.0) ** 2
             variance = (residual**2).sum(axis=1) / degrees + self.config.noise_levels**2
@@ -103,12 +104,12 @@ class ProfileModel:
         covariance = np.linalg.inv(information + 1e-9 * np.eye(3)) * np.outer(unit, unit)
         return ProfileFit(pose=pose, covariance=np.asarray(covariance, dtype=np.float64), explained=explained)
 
-    def _read(self, image: Image32, pixels: Array, normals: Array) -> Array:
+    def _read(self, image: Image32, pixels: Array, normals: Array) -> Image32:
         """Brightness (N, S) along the normals, each profile's mean taken off."""
         u = (pixels[:, :1] + self._offsets_px * normals[:, :1]).astype(np.float32)
         v = (pixels[:, 1:] + self._offsets_px * normals[:, 1:]).astype(np.float32)
-        seen = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
-        return seen - seen.mean(axis=1, keepdims=True)
+        seen = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(seen - seen.mean(axis=1, keepdims=True), dtype=np.float32)
 
     def _explained(self, seen: Array | Image32, residual: Array | Image32, normals: Array) -> Array:
         """Mean over samples of what (N, S, ...) profiles have explained, (...)."""
