@@ -9,12 +9,11 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
 from cad.parts import Part, hash_file, load_part
 from perception.estimates import PoseEstimator
 from twin.doctor import versions
 from twin.pick_config import PickConfig
+from twin.report import ScenesProgress
 from twin.robot import TwinError
 from twin.scorecard import SceneResult, build_scorecard, write_json
 
@@ -26,21 +25,11 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
     """
     _check_writable(config.out)
     weights = check_weights(config)
-    with Progress(
-        TextColumn("picking"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("scenes  {task.fields[placed]} of {task.fields[presented]} parts succeeded"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        disable=quiet,
-    ) as progress:
-        task = progress.add_task("picking", total=config.scenes, placed=0, presented=0)
-        results: list[SceneResult] = []
+    results: list[SceneResult] = []
+    with ScenesProgress(config.scenes, quiet=quiet) as progress:
         for result in _run_scenes(config):
             results.append(result)
-            parts = [p for r in results for p in r.parts]
-            progress.update(task, advance=1, placed=sum(p.succeeded for p in parts), presented=len(parts))
+            progress.show(results)
     results.sort(key=lambda r: r.scene)
     card = build_scorecard(
         results,

@@ -3,15 +3,54 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from cad.parts import Part
+from twin.scorecard import SceneResult
+
+
+class ScenesProgress:
+    """Progress of a pick run: a bar on a terminal, a line a scene elsewhere, nothing when ``quiet``."""
+
+    def __init__(self, scenes: int, *, quiet: bool) -> None:
+        self._scenes, self._started = scenes, time.monotonic()
+        self._console = Console(stderr=True, quiet=quiet)
+        self._bar = Progress(
+            TextColumn("picking"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("scenes, {task.fields[state]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("picking", total=scenes, state="no part yet")
+
+    def __enter__(self) -> ScenesProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, results: Sequence[SceneResult]) -> None:
+        """Tell how far the run is after the scenes in ``results``."""
+        parts = [p for r in results for p in r.parts]
+        state = f"{sum(p.succeeded for p in parts)} of {len(parts)} parts succeeded"
+        self._bar.update(self._task, completed=len(results), state=state)
+        if not self._console.is_terminal:
+            elapsed = time.monotonic() - self._started
+            left = elapsed / len(results) * (self._scenes - len(results))
+            self._console.print(f"scene {len(results)} of {self._scenes}, {state}, {left:.0f} s left", soft_wrap=True)
 
 
 def _number(value: float | None, digits: int = 3) -> str:
