@@ -78,6 +78,13 @@ def flip(window: Window, rng: np.random.Generator) -> Window:
     return Window(np.ascontiguousarray(image), np.ascontiguousarray(instances), centres, window.classes)
 
 
+def draw_small(window: Window, rng: np.random.Generator) -> int | None:
+    """One of the instances, small ones more often since they are the hard ones; None when there is none."""
+    area = np.bincount(window.instances.ravel(), minlength=len(window.centres) + 1)[1:]
+    weight = np.where(area >= MIN_VISIBLE_PX, 1.0 / np.maximum(area, 1), 0.0)
+    return int(rng.choice(len(area), p=weight / weight.sum())) if weight.any() else None
+
+
 def cut(window: Window, size: int, rng: np.random.Generator, near: float = 0.7) -> Window:
     """A square of ``size`` pixels, with probability ``near`` one that holds the centre of a part.
 
@@ -87,9 +94,9 @@ def cut(window: Window, size: int, rng: np.random.Generator, near: float = 0.7) 
     if np.any(limit < 0):
         raise ValueError(f"cannot cut {size} pixels from a window of {window.instances.shape}")
     u, v = rng.integers(0, limit + 1)
-    if len(window.centres) and rng.random() < near:
-        centre = window.centres[rng.integers(len(window.centres))]
-        u, v = np.clip((centre - rng.uniform(0, size, 2)).astype(int), 0, limit)
+    k = draw_small(window, rng) if rng.random() < near else None
+    if k is not None:
+        u, v = np.clip((window.centres[k] - rng.uniform(0, size, 2)).astype(int), 0, limit)
     place = np.s_[v : v + size, u : u + size]
     return Window(window.image[place], window.instances[place], window.centres - [u, v], window.classes)
 
@@ -111,32 +118,38 @@ def warp(window: Window, rng: np.random.Generator) -> Window:
     )
 
 
-def paste(window: Window, other: Window, rng: np.random.Generator, margin: int = 6) -> Window:
-    """A part of ``other`` with its shadow's rim copied to a place without parts; the window itself if none is free."""
-    area = np.bincount(other.instances.ravel(), minlength=len(other.centres) + 1)
-    choices = np.nonzero(area[1:] >= 4 * MIN_VISIBLE_PX)[0]
-    if not len(choices):
+def paste(window: Window, other: Window, rng: np.random.Generator, margin: int = 24) -> Window:
+    """A part of ``other`` with its shadow, copied to where it covers no part; the window itself if that fails.
+
+    The shadow is what is darker than its surroundings within ``margin`` pixels, and darkens the new ground likewise.
+    """
+    k = draw_small(other, rng)
+    if k is None:
         return window
-    k = int(rng.choice(choices))
-    v, u = np.nonzero(other.instances == k + 1)
-    height, width = window.instances.shape
-    if min(u.min(), v.min()) < margin or u.max() >= width - margin or v.max() >= height - margin:
+    own = other.instances == k + 1
+    u, v, w, h = cv2.boundingRect(own.astype(np.uint8))
+    height, width = own.shape
+    if u == 0 or v == 0 or u + w == width or v + h == height:
         return window
-    box = np.s_[v.min() - margin : v.max() + margin + 1, u.min() - margin : u.max() + margin + 1]
-    patch, own = other.image[box].astype(np.float32), other.instances[box] == k + 1
-    brightness = np.exp(rng.normal(0.0, 0.25))
-    j = int(rng.integers(0, height - own.shape[0] + 1))
-    i = int(rng.integers(0, width - own.shape[1] + 1))
+    top, left = max(0, v - margin), max(0, u - margin)
+    box = np.s_[top : min(height, v + h + margin), left : min(width, u + w + margin)]
+    patch, own, ground = other.image[box].astype(np.float32), own[box], other.instances[box] == 0
+    j = int(rng.integers(0, window.instances.shape[0] - own.shape[0] + 1))
+    i = int(rng.integers(0, window.instances.shape[1] - own.shape[1] + 1))
     place = np.s_[j : j + own.shape[0], i : i + own.shape[1]]
-    if window.instances[place].any():
+    reach = cv2.dilate(own.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    if window.instances[place][reach].any():
         return window
-    image, instances = window.image.copy(), window.instances.copy()
+    gray = patch.mean(axis=2)
+    shade = np.where(ground, np.clip(gray / max(1.0, float(np.median(gray[ground]))), 0.2, 1.0), 1.0)
+    shade = np.where(shade < 0.85, shade, 1.0)[..., None]
     alpha = cv2.GaussianBlur(own.astype(np.float32), (0, 0), 0.6)[..., None]
-    if rng.random() < 0.5:
-        alpha = np.maximum(alpha, 0.5 * cv2.GaussianBlur(own.astype(np.float32), (0, 0), 3.0)[..., None])
-    image[place] = np.clip(alpha * brightness * patch + (1 - alpha) * image[place], 0, 255).astype(np.uint8)
+    image, instances = window.image.copy(), window.instances.copy()
+    brightness = np.exp(rng.normal(0.0, 0.25))
+    pasted = alpha * brightness * patch + (1 - alpha) * shade * image[place]
+    image[place] = np.clip(pasted, 0, 255).astype(np.uint8)
     instances[place][own] = len(window.centres) + 1
-    shift = np.array([i - box[1].start, j - box[0].start])
+    shift = np.array([i - left, j - top])
     return Window(
         image,
         instances,
