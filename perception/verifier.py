@@ -77,8 +77,8 @@ class PairSampler:
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
         """Views (2N, 96, 96, 3), their rays (2N, 2) and targets (N, 2 F + 1).
 
-        One view is at the true yaw, the other half a turn away (sometimes any other angle); both are off by what J is
-        off by.
+        One view is at the true yaw, the other half a turn away (sometimes any other angle). Both are off by what J is
+        off by: 2 degrees, and a centre whose error has a median of 1.6 crop pixels and a long tail.
         """
         n = len(images)
         views = np.empty((2 * n, RECTIFIED, RECTIFIED, 3), np.uint8)
@@ -88,7 +88,8 @@ class PairSampler:
             away = np.pi if rng.random() < 0.85 else rng.uniform(0.6, 2 * np.pi - 0.6)
             yaw = labels.yaw[i] if labels.has_part[i] else rng.uniform(-np.pi, np.pi)
             offsets = (0.0, away) if rng.random() < 0.5 else (away, 0.0)
-            off_px, off_rad = rng.normal(0.0, 1.0, 2), rng.normal(0.0, np.radians(2.0))
+            off_px = rng.normal(0.0, 0.5 + rng.exponential(1.3), 2)
+            off_rad = rng.normal(0.0, np.radians(2.0))
             for view, offset in enumerate(offsets):
                 views[2 * i + view], rays[2 * i + view] = rectify(
                     images[i],
