@@ -9,6 +9,7 @@ exact.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +20,7 @@ from cad.parts import Part
 from cad.spatial import Array, Intrinsics
 from perception.edges import EdgeSamples, visible_edges
 from perception.gradients import EdgeImage, across
-from perception.profiles import ProfileConfig, ProfileModel
+from perception.profiles import ProfileConfig, ProfileFit, ProfileModel
 from perception.table_camera import TableCamera
 
 
@@ -29,6 +30,8 @@ class ContourConfig:
 
     ``starts`` peaks of the grid are followed, each by one Gauss-Newton step for every entry of ``reach_px``; of the
     scanned neighbourhoods the best ``candidates`` are fitted. ``stride`` thins the samples until the last step.
+    A start is taken to be right within ``start_sigma_m``: a candidate at that distance must explain ``stray_cost`` more
+    of the brightness than one at the start. ``places`` that are ``apart_m`` and explain ``nearly`` as much are told.
     The stated covariance is ``covariance_scale`` times that of independent noise, plus the squares of ``floor_m`` and
     ``floor_yaw``, as errors on validation crops ask for: parts lean a little, and shading is not even.
     """
@@ -45,6 +48,11 @@ class ContourConfig:
     stride: int = 4
     rounds: int = 3
     inlier_px: float = 1.0
+    start_sigma_m: float = 3.5e-4
+    stray_cost: float = 0.005
+    places: int = 2
+    apart_m: float = 1.5e-4
+    nearly: float = 0.08
     covariance_scale: float = 4.0
     floor_m: float = 1.6e-5
     floor_yaw: float = float(np.radians(0.05))
@@ -96,6 +104,25 @@ def refine(
     config, at full resolution 8 pixels and 5 degrees. Always returns the best fit found: the caller judges it by its
     scores, since a covariance stays small at a wrong optimum.
     """
+    return refine_all(image, intrinsics, part, stable_pose, T_cam_table, x, y, yaw, config)[0]
+
+
+def refine_all(
+    image: NDArray[np.uint8] | EdgeImage,
+    intrinsics: Intrinsics,
+    part: Part,
+    stable_pose: int,
+    T_cam_table: Array,
+    x: float,
+    y: float,
+    yaw: float,
+    config: ContourConfig | None = None,
+) -> list[Refinement]:
+    """Like ``refine``, but with every place that explains the image about as well, the best first.
+
+    The outline of a shadow, or the inner edge of a rim, can look like the part's own outline; what lies inside of it
+    tells them apart (see ``region``), which is for the caller to weigh.
+    """
     config = config or ContourConfig()
     edges = image if isinstance(image, EdgeImage) else EdgeImage.of(image)
     camera = TableCamera(intrinsics=intrinsics, T_cam_table=T_cam_table)
@@ -108,13 +135,17 @@ def refine(
     rough = ProfileModel(sparse, camera, metres_per_pixel, config.profile)
     rougher = ProfileModel(sparse.every(2), camera, metres_per_pixel, config.profile)
     pool = [scanned for pose in near for scanned in _scan(edges, rougher, pose, config)]
-    best = sorted(pool, key=lambda scored: -scored[0])[: config.candidates]
+    best = sorted(pool, key=lambda scored: _strayed(start, scored[1], config) - scored[0])[: config.candidates]
     fits = [rough.fit(edges.gray, pose, config.rounds) for _, pose in best]
-    pose = max(fits, key=lambda fit: fit.explained).pose
-
     exact = ProfileModel(samples, camera, metres_per_pixel, config.profile)
-    fit = exact.fit(edges.gray, pose, config.rounds)
-    matched, matched_outline, correlation = _agreement(edges, camera, samples, fit.pose, config)
+    return [
+        _result(edges, exact, exact.fit(edges.gray, fit.pose, config.rounds), config)
+        for fit in _distinct(start, fits, config)
+    ]
+
+
+def _result(edges: EdgeImage, model: ProfileModel, fit: ProfileFit, config: ContourConfig) -> Refinement:
+    matched, matched_outline, correlation = _agreement(edges, model.camera, model.samples, fit.pose, config)
     return Refinement(
         x=float(fit.pose[0]),
         y=float(fit.pose[1]),
@@ -126,6 +157,18 @@ def refine(
         correlation=correlation,
         explained=fit.explained,
     )
+
+
+def _distinct(start: Array, fits: Sequence[ProfileFit], config: ContourConfig) -> list[ProfileFit]:
+    """The best fit, and others in a different place that explain nearly as much; ``places`` in all."""
+    ranked = sorted(fits, key=lambda fit: _strayed(start, fit.pose, config) - fit.explained)
+    kept = ranked[:1]
+    for fit in ranked[1:]:
+        close = ranked[0].explained - fit.explained < config.nearly
+        apart = all(np.hypot(*(fit.pose - other.pose)[:2]) > config.apart_m for other in kept)
+        if close and apart and len(kept) < config.places:
+            kept.append(fit)
+    return kept
 
 
 def _grid(
@@ -199,6 +242,11 @@ def _scan(edges: EdgeImage, model: ProfileModel, pose: Array, config: ContourCon
     explained = model.explained_at(edges.gray, pose, np.stack([du, dv], axis=1)).reshape(len(shifts), -1)
     peaks = np.argwhere(explained == maximum_filter(explained, size=3))
     return [(float(explained[j, k]), model.camera.shifted(pose, float(shifts[j]), float(shifts[k]))) for j, k in peaks]
+
+
+def _strayed(start: Array, pose: Array, config: ContourConfig) -> float:
+    """What a candidate's distance from the start costs, in units of the explained share."""
+    return config.stray_cost * float(((pose - start)[:2] ** 2).sum()) / config.start_sigma_m**2
 
 
 def _agreement(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cad.parts import planar
 from cad.spatial import Array, Intrinsics, apply, rotation_angle, wrap_angle
 from perception.choice import FEATURES, ChoiceWeights, gate_evidence
-from perception.contour import ContourConfig, Refinement, refine
+from perception.contour import ContourConfig, Refinement, refine_all
 from perception.faces import Face
 from perception.gradients import EdgeImage
 from perception.labels import ray_of_crop
@@ -141,32 +141,25 @@ class CropSolver:
         found: list[Candidate] = []
         for h in self._with_keypoint_yaws(hypotheses, votes, small, T_cam_table):
             face = self.nets.table[self.nets.table.index_of(h.part, h.stable_pose)]
-            x, y = on_plane(h.centre_px, face.middle_m, small, T_cam_table)[:2]
-            r = refine(
-                edges,
-                intrinsics,
-                face.part,
-                h.stable_pose,
-                T_cam_table,
-                float(x),
-                float(y),
-                h.yaw,
-                self.config.contour,
+            x, y = (float(c) for c in on_plane(h.centre_px, face.middle_m, small, T_cam_table)[:2])
+            places = refine_all(
+                edges, intrinsics, face.part, h.stable_pose, T_cam_table, x, y, h.yaw, self.config.contour
             )
             keypoints = votes.get((h.part, h.stable_pose))
-            candidate = Candidate(face=face, refinement=r, evidence=np.zeros(len(FEATURES)), keypoints=keypoints)
-            if any(_same_pose(candidate, other) for other in found):
-                continue
-            evidence = {
-                "classifier": h.classifier,
-                "verifier": h.verifier,
-                "matched_fraction": r.matched_fraction,
-                "matched_outline": r.matched_outline,
-                "correlation": r.correlation,
-                "explained": r.explained,
-                "keypoints": self._keypoint_agreement(candidate, small, T_cam_table),
-            }
-            found.append(replace(candidate, evidence=np.array([evidence.get(name, 0.0) for name in FEATURES])))
+            for r in places:
+                candidate = Candidate(face=face, refinement=r, evidence=np.zeros(len(FEATURES)), keypoints=keypoints)
+                if any(_same_pose(candidate, other) for other in found):
+                    continue
+                evidence = {
+                    "classifier": h.classifier,
+                    "verifier": h.verifier,
+                    "matched_fraction": r.matched_fraction,
+                    "matched_outline": r.matched_outline,
+                    "correlation": r.correlation,
+                    "explained": r.explained,
+                    "keypoints": self._keypoint_agreement(candidate, small, T_cam_table),
+                }
+                found.append(replace(candidate, evidence=np.array([evidence.get(name, 0.0) for name in FEATURES])))
         views = [render_view(c.face.part, c.T_cam_part(T_cam_table), small).facet for c in found]
         half_gray = np.asarray(cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA), np.uint8)
         for candidate, region in zip(found, region_scores(half_gray, views), strict=True):
@@ -240,11 +233,11 @@ def _half(crop: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _same_pose(a: Candidate, b: Candidate) -> bool:
-    """Whether two candidates are one pose, up to the part's symmetries: within 0.3 mm and 3 degrees."""
+    """Whether two candidates are one pose, up to the part's symmetries: within 0.1 mm and 2 degrees."""
     if a.face.part is not b.face.part:
         return False
     pa = planar(a.refinement.x, a.refinement.y, a.refinement.yaw) @ a.face.stable_pose.T_table_part
     pb = planar(b.refinement.x, b.refinement.y, b.refinement.yaw) @ b.face.stable_pose.T_table_part
-    if np.linalg.norm(pa[:3, 3] - pb[:3, 3]) > 3e-4:
+    if np.linalg.norm(pa[:3, 3] - pb[:3, 3]) > 1e-4:
         return False
-    return min(rotation_angle(pa[:3, :3], pb[:3, :3] @ S) for S in a.face.part.symmetries) < np.radians(3.0)
+    return min(rotation_angle(pa[:3, :3], pb[:3, :3] @ S) for S in a.face.part.symmetries) < np.radians(2.0)

@@ -36,7 +36,7 @@ NEUTRAL = ChoiceWeights(
 """Stand-ins while evidence is collected: they only order hypotheses."""
 
 RIGHT_YAW = np.radians(6.0)
-RIGHT_PLACE_M = 8e-4
+RIGHT_PLACE_M = 1.5e-4
 BATCH = 32
 
 
@@ -52,7 +52,7 @@ class ChoiceFitConfig:
     data: Path
     out: Path
     choice_share: float = 0.6
-    wanted_right: float = 0.98
+    wanted_right: float = 0.97
     refined: int = 4
     nats: float = 7.0
 
@@ -123,7 +123,7 @@ def fit_weights(found: list[CropEvidence], config: ChoiceFitConfig) -> tuple[Cho
     weights = replace(weights, gate=fit_gate(winners, right))
     probability = weights.probability_right(winners)
     weights = replace(weights, accept_above=threshold_for(probability, right, config.wanted_right))
-    accepted = probability > weights.accept_above
+    accepted = (probability > weights.accept_above) & np.array([e.not_a_part <= 0.5 for e in second])
     has = np.array([e.has_part for e in second])
     figures = {
         "crops": float(len(second)),
