@@ -37,6 +37,9 @@ NEUTRAL = ChoiceWeights(
 
 RIGHT_YAW = np.radians(6.0)
 RIGHT_PLACE_M = 1.5e-4
+"""What the choice is to find: the right face and yaw, in the right place among rims and shadows."""
+USABLE_PLACE_M = 3e-4
+"""What the gate is to predict: a pose good enough for placing a part."""
 BATCH = 32
 
 
@@ -45,16 +48,16 @@ class ChoiceFitConfig:
     """``data`` is a data set of full-resolution crops (256 x 256), ``out`` the folder with the networks' weights, to
     which ``choice.json`` is written. ``choice_share`` of the crops are for the choice, the others for the gate.
 
-    ``wanted_right`` is the share of right ones that the gate asks of accepted estimates; ``refined`` and ``nats`` are
+    ``wanted_right`` is the share of usable ones that the gate asks of accepted estimates; ``refined`` and ``nats`` are
     as in CropPoseConfig.
     """
 
     data: Path
     out: Path
     choice_share: float = 0.6
-    wanted_right: float = 0.97
-    refined: int = 4
-    nats: float = 7.0
+    wanted_right: float = 0.98
+    refined: int = 3
+    nats: float = 6.0
 
     def __post_init__(self) -> None:
         for name in ("choice_share", "wanted_right"):
@@ -64,10 +67,14 @@ class ChoiceFitConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropEvidence:
-    """One crop's hypotheses: evidence (H, F) and which are right (H,); what says, and what shows, a part at all."""
+    """One crop's hypotheses: evidence (H, F), which are right, and which are usable (H,).
+
+    ``not_a_part`` is the networks' probability that there is none, ``has_part`` the truth.
+    """
 
     evidence: Array
     right: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
     not_a_part: float
     has_part: bool
 
@@ -89,7 +96,8 @@ def collect_evidence(solver: CropSolver, crops: CropSet, report: Callable[[str],
             out.append(
                 CropEvidence(
                     evidence=np.stack([c.evidence for c in pose.candidates]),
-                    right=np.array([_is_right(solver, crops, truth, i, c) for c in pose.candidates]),
+                    right=np.array([_is_right(solver, crops, truth, i, c, RIGHT_PLACE_M) for c in pose.candidates]),
+                    usable=np.array([_is_right(solver, crops, truth, i, c, USABLE_PLACE_M) for c in pose.candidates]),
                     not_a_part=pose.not_a_part,
                     has_part=bool(truth.part_index[i] >= 0),
                 )
@@ -98,14 +106,14 @@ def collect_evidence(solver: CropSolver, crops: CropSet, report: Callable[[str],
     return out
 
 
-def _is_right(solver: CropSolver, crops: CropSet, truth: Labels, i: int, candidate: Candidate) -> bool:
+def _is_right(solver: CropSolver, crops: CropSet, truth: Labels, i: int, candidate: Candidate, within_m: float) -> bool:
     """Whether a candidate is the crop's target, or looks exactly like it, and lies where it is."""
     if truth.part_index[i] < 0:
         return False
     table = solver.nets.table
     face = table.index_of(table.parts[truth.part_index[i]].name, int(crops.stable_pose[i]))
     r = candidate.refinement
-    near = np.hypot(r.x - truth.x[i], r.y - truth.y[i]) < RIGHT_PLACE_M
+    near = np.hypot(r.x - truth.x[i], r.y - truth.y[i]) < within_m
     return bool(near and table.same_view(face, float(truth.yaw[i]), candidate.face.index, r.yaw, RIGHT_YAW))
 
 
@@ -119,32 +127,32 @@ def fit_weights(found: list[CropEvidence], config: ChoiceFitConfig) -> tuple[Cho
     first, second = found[:split], found[split:]
     choice = fit_choice_weights([e.evidence for e in first], [e.right for e in first])
     weights = replace(NEUTRAL, choice=choice)
-    winners, right = _winners(second, weights)
-    weights = replace(weights, gate=fit_gate(winners, right))
+    winners, usable = _winners(second, weights)
+    weights = replace(weights, gate=fit_gate(winners, usable))
     probability = weights.probability_right(winners)
-    weights = replace(weights, accept_above=threshold_for(probability, right, config.wanted_right))
+    weights = replace(weights, accept_above=threshold_for(probability, usable, config.wanted_right))
     accepted = (probability > weights.accept_above) & np.array([e.not_a_part <= 0.5 for e in second])
     has = np.array([e.has_part for e in second])
     figures = {
         "crops": float(len(second)),
-        "right": float(right[has].mean()),
-        "best_possible": float(np.mean([e.right.any() for e in second if e.has_part])),
+        "usable": float(usable[has].mean()),
+        "best_possible": float(np.mean([e.usable.any() for e in second if e.has_part])),
         "accepted_share": float(accepted[has].mean()),
-        "right_of_accepted": float(right[accepted].mean()) if accepted.any() else 0.0,
+        "usable_of_accepted": float(usable[accepted].mean()) if accepted.any() else 0.0,
         "empty_accepted": float(accepted[~has].mean()) if (~has).any() else 0.0,
     }
     return weights, figures
 
 
 def _winners(found: list[CropEvidence], weights: ChoiceWeights) -> tuple[Array, NDArray[np.bool_]]:
-    """The gate's evidence of each crop's winner (N, G), and whether it is right (N,)."""
-    rows, right = [], []
+    """The gate's evidence of each crop's winner (N, G), and whether it is usable (N,)."""
+    rows, usable = [], []
     for e in found:
         scores = weights.scores(e.evidence)
         best = int(scores.argmax())
         rows.append(gate_evidence(scores, e.evidence, best, e.not_a_part))
-        right.append(bool(e.right[best]))
-    return np.stack(rows), np.array(right)
+        usable.append(bool(e.usable[best]))
+    return np.stack(rows), np.array(usable)
 
 
 def fit_choice(config: ChoiceFitConfig) -> Path:

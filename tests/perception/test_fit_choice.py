@@ -24,16 +24,16 @@ def evidence(rng: np.random.Generator, count: int = 600) -> list[CropEvidence]:
             right[rng.integers(3)] = True
             e[right, FEATURES.index("matched_fraction")] += 0.5
         not_a_part = float(rng.beta(1, 9) if has else rng.beta(9, 1))
-        out.append(CropEvidence(evidence=e, right=right, not_a_part=not_a_part, has_part=has))
+        out.append(CropEvidence(evidence=e, right=right, usable=right, not_a_part=not_a_part, has_part=has))
     return out
 
 
 def test_fitted_weights_choose_and_decline_well() -> None:
     weights, figures = fit_weights(evidence(np.random.default_rng(0)), CONFIG)
     assert weights.choice["matched_fraction"] > 0
-    assert figures["right"] > 0.95
+    assert figures["usable"] > 0.95
     assert figures["best_possible"] == 1.0
-    assert figures["right_of_accepted"] >= CONFIG.wanted_right
+    assert figures["usable_of_accepted"] >= CONFIG.wanted_right
     assert figures["accepted_share"] > 0.8
     assert figures["empty_accepted"] < 0.1
 
