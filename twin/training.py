@@ -1,4 +1,4 @@
-"""``tagcell train``: render what is missing, then train every network, each for its share of the time."""
+"""``tagcell train``: render what is missing, train every network for its share of the time, fit the choice."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_type_hints
 
+from perception.fit_choice import ChoiceFitConfig, fit_choice
 from perception.train import trainer
 from scenes.generate import DatasetConfig, generate
 
@@ -15,6 +16,7 @@ DATASETS: dict[str, DatasetConfig] = {
     "crops_val": DatasetConfig(kind="crop", split="val", count=1_500, seed=2),
     "windows_train": DatasetConfig(kind="scene", split="train", count=4_000, seed=3, chunk=250),
     "windows_val": DatasetConfig(kind="scene", split="val", count=200, seed=4, chunk=250),
+    "fine_val": DatasetConfig(kind="fine", split="val", count=1_200, seed=5, chunk=300),
 }
 """What the committed weights were trained on; ``tagcell train --seed`` shifts the seeds."""
 
@@ -28,7 +30,7 @@ SHARES: dict[str, tuple[str, float]] = {
 
 
 def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int, jobs: int | None = None) -> list[Path]:
-    """Weights of every network in ``out/weights``; returns their paths.
+    """Weights of every network, and the choice fitted on them, in ``out/weights``; returns their paths.
 
     Raises SceneError or PerceptionError when a folder holds other data or cannot be written, ValueError for a budget
     that is not positive. What is there already, data and checkpoints, is kept.
@@ -51,7 +53,8 @@ def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int,
             )
         )
         written.append(out / "weights" / f"{name}.safetensors")
-    return written
+    fit_choice(ChoiceFitConfig(data=data / "fine_val", out=out / "weights"))
+    return [*written, out / "weights" / "choice.json"]
 
 
 def _for_run(config: DatasetConfig, seed: int, jobs: int) -> DatasetConfig:
