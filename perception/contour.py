@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics
 from perception.edges import EdgeSamples, visible_edges
-from perception.gradients import EdgeImage, across
+from perception.gradients import EdgeImage, Image32, across
 from perception.profiles import ProfileConfig, ProfileFit, ProfileModel
 from perception.table_camera import TableCamera
 
@@ -88,7 +88,7 @@ class Refinement:
 
 
 def refine(
-    image: NDArray[np.uint8] | EdgeImage,
+    image: NDArray[np.uint8] | Image32 | EdgeImage,
     intrinsics: Intrinsics,
     part: Part,
     stable_pose: int,
@@ -108,7 +108,7 @@ def refine(
 
 
 def refine_all(
-    image: NDArray[np.uint8] | EdgeImage,
+    image: NDArray[np.uint8] | Image32 | EdgeImage,
     intrinsics: Intrinsics,
     part: Part,
     stable_pose: int,

@@ -15,7 +15,7 @@ from cad.spatial import Array, Intrinsics, apply, rotation_angle, wrap_angle
 from perception.choice import FEATURES, ChoiceWeights, gate_evidence
 from perception.contour import ContourConfig, Refinement, refine_all
 from perception.faces import Face
-from perception.gradients import EdgeImage
+from perception.gradients import EdgeImage, Image32, brightness
 from perception.labels import ray_of_crop
 from perception.planar import PlanarError, on_plane, solve_planar
 from perception.posenets import CropKeypoints, CropReading, Hypothesis, PoseNets
@@ -118,8 +118,7 @@ class CropSolver:
         out = []
         for i, (crop, reading) in enumerate(zip(crops, readings, strict=True)):
             mine = {face: votes[i, face] for row, face in faces if row == i}
-            gray = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
-            candidates = self._refined(np.asarray(gray, np.uint8), intrinsics[i], T_cam_table[i], kept[i], mine)
+            candidates = self._refined(brightness(crop), intrinsics[i], T_cam_table[i], kept[i], mine)
             out.append(self._choose(candidates, reading))
         spent["refinement"] = time.perf_counter() - started
         return out
@@ -131,7 +130,7 @@ class CropSolver:
 
     def _refined(
         self,
-        gray: NDArray[np.uint8],
+        gray: Image32,
         intrinsics: Intrinsics,
         T_cam_table: Array,
         hypotheses: Sequence[Hypothesis],
@@ -161,7 +160,7 @@ class CropSolver:
                 }
                 found.append(replace(candidate, evidence=np.array([evidence.get(name, 0.0) for name in FEATURES])))
         views = [render_view(c.face.part, c.T_cam_part(T_cam_table), small).facet for c in found]
-        half_gray = np.asarray(cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA), np.uint8)
+        half_gray = cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA).astype(np.float32)
         for candidate, region in zip(found, region_scores(half_gray, views), strict=True):
             candidate.evidence[FEATURES.index("region_fit")] = region.fit
             candidate.evidence[FEATURES.index("region_unexplained")] = region.unexplained

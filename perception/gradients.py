@@ -33,8 +33,8 @@ class EdgeImage:
     fine: tuple[Image32, Image32]
 
     @staticmethod
-    def of(gray: NDArray[np.uint8]) -> EdgeImage:
-        """Gradients of a gray image (H, W)."""
+    def of(gray: NDArray[np.uint8] | Image32) -> EdgeImage:
+        """Gradients of a gray image (H, W) in grey levels."""
         gu, gv = _derivatives(gray, FINE_SIGMA_PX)
         return EdgeImage(
             gray=gray.astype(np.float32),
@@ -45,7 +45,15 @@ class EdgeImage:
         )
 
 
-def _derivatives(gray: NDArray[np.uint8], sigma_px: float) -> tuple[Image32, Image32]:
+def brightness(image: NDArray[np.uint8]) -> Image32:
+    """Mean of the colour channels (H, W) of an image (H, W, 3), not rounded.
+
+    It is less noisy than luminance, and keeps contrasts between bluish metal and neutral grounds that luminance loses.
+    """
+    return image.mean(axis=2, dtype=np.float32)
+
+
+def _derivatives(gray: NDArray[np.uint8] | Image32, sigma_px: float) -> tuple[Image32, Image32]:
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
     gu = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     gv = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)

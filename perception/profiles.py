@@ -27,7 +27,7 @@ class ProfileConfig:
     step_px: float = 0.5
     blur_px: float = 0.8
     reach_px: float = 1.5
-    noise_levels: float = 2.0
+    noise_levels: float = 0.7
 
     def __post_init__(self) -> None:
         if not 0 < self.step_px < self.half_length_px:

@@ -39,7 +39,9 @@ class RegionScore:
     unexplained: float
 
 
-def region_scores(gray: NDArray[np.uint8], labels: Sequence[NDArray[np.int32]]) -> list[RegionScore]:
+def region_scores(
+    gray: NDArray[np.uint8] | NDArray[np.float32], labels: Sequence[NDArray[np.int32]]
+) -> list[RegionScore]:
     """Scores of hypotheses on one gray image (H, W), each given by its facet map (H, W), -1 off the part.
 
     All are judged on the same pixels, the union of the silhouettes and a margin, so that their scores compare.
@@ -56,7 +58,7 @@ def region_scores(gray: NDArray[np.uint8], labels: Sequence[NDArray[np.int32]]) 
     return [RegionScore(fit=_fit(gray, label, domain), unexplained=_unexplained(strength, label)) for label in labels]
 
 
-def _fit(gray: NDArray[np.uint8], label: NDArray[np.int32], domain: NDArray[np.bool_]) -> float:
+def _fit(gray: NDArray[np.uint8] | NDArray[np.float32], label: NDArray[np.int32], domain: NDArray[np.bool_]) -> float:
     v, u = np.nonzero(domain)
     _, patch, count = np.unique(label[v, u], return_inverse=True, return_counts=True)
     value = gray[v, u].astype(np.float64)
@@ -90,7 +92,7 @@ def _linear_patches(u: Array, v: Array, value: Array, patch: NDArray[np.int64], 
     return residual, scale
 
 
-def _edge_strength(gray: NDArray[np.uint8]) -> Array:
+def _edge_strength(gray: NDArray[np.uint8] | NDArray[np.float32]) -> Array:
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), _EDGE_SIGMA_PX)
     gu = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
     gv = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
