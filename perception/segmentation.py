@@ -170,6 +170,7 @@ def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = 
     rows, columns = (axis.cpu().numpy() for axis in torch.nonzero(maxima & (heat > config.peak), as_tuple=True))
     heat = heat.cpu().numpy()
     order = np.argsort(-heat[rows, columns], kind="stable")[: config.max_peaks]
+    order = [q for i, q in enumerate(order) if not _near(rows, columns, q, order[:i])]
     rows, columns = rows[order], columns[order]
     mask = outputs.mask[index].sigmoid().cpu().numpy()
     v, u = np.nonzero(mask > config.mask)
@@ -210,6 +211,11 @@ def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = 
             )
         )
     return sorted(found, key=lambda detection: -detection.score)
+
+
+def _near(rows: NDArray[np.int64], columns: NDArray[np.int64], peak: int, better: NDArray[np.int64]) -> bool:
+    """Whether a peak is within two cells of a better one: neighbouring cells can tie, at bfloat16 often."""
+    return bool(np.any((abs(rows[better] - rows[peak]) <= 2) & (abs(columns[better] - columns[peak]) <= 2)))
 
 
 def _largest_blob(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.bool_]:

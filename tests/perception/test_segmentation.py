@@ -74,6 +74,13 @@ def test_stray_pixels_do_not_widen_a_mask() -> None:
     assert detection.mask.any(axis=0).all() and detection.mask.any(axis=1).all()
 
 
+def test_two_equal_cells_at_a_peak_are_one_part() -> None:
+    outputs = perfect_outputs(draw(np.random.default_rng(0), centres=[(60.0, 60.0)]))
+    row, column = np.unravel_index(int(outputs.heat[0].argmax()), outputs.heat[0].shape)
+    outputs.heat[0, row, column + 1] = outputs.heat[0, row, column]
+    assert len(decode(outputs, 0, DecodeConfig(), reduction=1)) == 1
+
+
 def test_parts_cut_by_the_border_are_found() -> None:
     window = draw(np.random.default_rng(0), centres=[(-2.0, 60.0), (124.0, 130.0)])
     found = decode(perfect_outputs(window), 0, DecodeConfig(), reduction=1)
