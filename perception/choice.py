@@ -34,6 +34,9 @@ FEATURES = (
 """Evidence for a hypothesis: natural log-probabilities of J and V, scores of the contour and of the region, and minus
 the distance between voted and refined keypoints in camera pixels."""
 
+AGAINST = ("region_unexplained",)
+"""Evidence that speaks against a hypothesis the larger it is; all other evidence speaks for it."""
+
 GATE_FEATURES = ("constant", "lead", "not_a_part", "matched_fraction", "correlation", "explained")
 """Evidence for the winner: its lead in score, the log-odds of "not a part", and its contour's absolute scores."""
 
@@ -111,7 +114,8 @@ def fit_choice_weights(
     """Weights of the choice by listwise logistic regression.
 
     ``evidence`` holds for every crop (H, len(FEATURES)), ``right`` (H,) bool; crops with one hypothesis, or none that
-    is right, say nothing and are left out. Evidence is scaled by its spread within crops before the penalty applies.
+    is right, say nothing and are left out. No weight takes the sign that its evidence cannot have. Evidence is scaled
+    by its spread within crops before the penalty applies.
     """
     pairs = [
         (e, r.astype(bool)) for e, r in zip(evidence, right, strict=True) if len(e) > 1 and r.any() and not r.all()
@@ -132,7 +136,8 @@ def fit_choice_weights(
             gradient = gradient - (x.T @ (p * (r / mass - 1.0))) / len(pairs)
         return total, gradient
 
-    found = minimize(loss, np.zeros(len(FEATURES)), jac=True, method="L-BFGS-B")
+    bounds = [(None, 0.0) if name in AGAINST else (0.0, None) for name in FEATURES]
+    found = minimize(loss, np.zeros(len(FEATURES)), jac=True, method="L-BFGS-B", bounds=bounds)
     return dict(zip(FEATURES, (found.x / spread).tolist(), strict=True))
 
 
