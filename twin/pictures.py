@@ -31,7 +31,8 @@ def annotate(frame: Frame, estimate: FrameEstimate, chosen: Array | None = None,
     a mask is drawn with the silhouette of its CAD at the estimated pose. Returns RGB.
     """
     estimate = replace(estimate, parts=tuple(_with_mask(p, frame.intrinsics) for p in estimate.parts))
-    overview = cv2.resize(frame.image, None, fx=1 / OVERVIEW, fy=1 / OVERVIEW, interpolation=cv2.INTER_AREA)
+    size = frame.intrinsics.width // OVERVIEW, frame.intrinsics.height // OVERVIEW
+    overview = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
     for part in estimate.parts:
         u, v, w, h = _box(part, frame.intrinsics)
         corner, opposite = (int(u / OVERVIEW), int(v / OVERVIEW)), (int((u + w) / OVERVIEW), int((v + h) / OVERVIEW))
@@ -77,9 +78,8 @@ def _inset(frame: Frame, part: PartEstimate, chosen: Array | None, opening_m: fl
         _draw_grasp(image, camera, chosen, opening_m, 2)
     _text(image, f"{part.part} face {part.stable_pose}", (8, 20), _colour(part))
     _text(image, part.verdict if not part.accepted else f"{part.score:.2f}", (8, INSET - 10), (255, 255, 255))
-    return cv2.copyMakeBorder(
-        image, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=_colour(part) if part.accepted else (200, 0, 0)
-    )
+    edge = _colour(part) if part.accepted else (200, 0, 0)
+    return np.asarray(cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=edge), np.uint8)
 
 
 def _rows(insets: Sequence[Image], width: int) -> list[Image]:
