@@ -64,14 +64,14 @@ def print_scorecard(card: dict[str, Any], out: Path) -> None:
     table = Table(title=f"{card['config']['estimator']} estimator, seed {card['config']['seed']}", title_justify="left")
     for column in (
         "part",
-        "presented",
-        "succeeded",
+        "shown",
+        "good",
         "rate",
-        "e_x mm",
-        "e_y mm",
-        "e_z mm",
-        "e_theta deg",
-        "branch right",
+        "x mm",
+        "y mm",
+        "z mm",
+        "theta",
+        "branch",
     ):
         table.add_column(column, justify="left" if column == "part" else "right")
     names = [*dict.fromkeys(p["part"] for p in card["parts"]), "all"]
