@@ -9,13 +9,13 @@ maps between pairs of hull vertices (right for solids with equal moments, such a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from cad.equivalence import Axis, Symmetries, symmetries_to_json
 from cad.meshes import distance_to_surface, surface_samples
 from cad.spatial import Array, rotation_from_rotvec, transform
 
@@ -29,19 +29,6 @@ _SAMPLES = 600
 _DENSE = 20_000
 _DOUBTFUL = 20  # points whose distance from the dense samples is largest, measured exactly
 _MAX_PAIRS = 4000
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Symmetries:
-    """Proper rotations that map a part onto itself, in the part's frame, metres.
-
-    ``discrete`` (S, 4, 4) leaves out the identity and what the continuous axes cover; ``continuous`` holds pairs of a
-    unit axis (3,) and a point on it (3,).
-    """
-
-    discrete: Array
-    continuous: tuple[tuple[Array, Array], ...]
-    tolerance_m: float
 
 
 def find_symmetries(mesh: trimesh.Trimesh, tolerance_m: float | None = None) -> Symmetries:
@@ -66,7 +53,7 @@ def find_symmetries(mesh: trimesh.Trimesh, tolerance_m: float | None = None) -> 
     c = checker.centre
     return Symmetries(
         discrete=np.array([transform(R, c - R @ c) for R in kept]).reshape(-1, 4, 4),
-        continuous=tuple((axis, c) for axis in axes),
+        continuous=tuple(Axis(direction=axis, point=c) for axis in axes),
         tolerance_m=checker.tolerance_m,
     )
 
@@ -77,14 +64,8 @@ def models_info(mesh: trimesh.Trimesh, symmetries: Symmetries) -> dict[str, Any]
     info: dict[str, Any] = {"diameter": round(1e3 * diameter(mesh), 6)}
     info |= {f"min_{a}": round(float(v), 6) for a, v in zip("xyz", low, strict=True)}
     info |= {f"size_{a}": round(float(v), 6) for a, v in zip("xyz", high - low, strict=True)}
-    scale = np.array([1e3, 1e3, 1e3])
-    discrete = symmetries.discrete.copy()
-    discrete[:, :3, 3] *= scale
-    info["symmetries_discrete"] = [np.round(T, 9).reshape(-1).tolist() for T in discrete]
-    info["symmetries_continuous"] = [
-        {"axis": np.round(axis, 9).tolist(), "offset": np.round(scale * point, 9).tolist()}
-        for axis, point in symmetries.continuous
-    ]
+    info |= symmetries_to_json(symmetries)
+    info["symmetry_tolerance"] = round(1e3 * symmetries.tolerance_m, 9)
     return info
 
 

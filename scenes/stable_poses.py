@@ -21,9 +21,10 @@ import trimesh
 from mujoco import rollout
 from scipy.spatial.transform import Rotation
 
+from cad.equivalence import Symmetries
 from cad.parts import Part, StablePose, load_part, part_names
 from cad.spatial import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from cad.symmetry import Symmetries, find_symmetries
+from cad.symmetry import find_symmetries
 from scenes.contacts import PART, Touches, make_collision, set_options
 from scenes.errors import SceneError
 from scenes.gl import mujoco
@@ -140,7 +141,7 @@ def canonical_rotation(up: Array) -> Array:
 def closest_equivalent(up: Array, target: Array, symmetries: Symmetries) -> Array:
     """Of all directions (3,) that a symmetry of the part makes of ``up``, the one nearest to ``target``."""
     options = [up, *(T[:3, :3] @ up for T in symmetries.discrete)]
-    for axis, _ in symmetries.continuous:
+    for axis in (a.direction for a in symmetries.continuous):
         across = target - (target @ axis) * axis
         if np.linalg.norm(across) > 1e-9:
             along = [float(u @ axis) for u in options]

@@ -71,7 +71,7 @@ def test_round_parts_have_a_continuous_axis_and_at_most_a_flip(make, flips, seed
         axis = R @ axis
     found = find_symmetries(mesh)
     assert len(found.continuous) == 1
-    assert abs(found.continuous[0][0] @ axis) == pytest.approx(1.0, abs=1e-4)
+    assert abs(found.continuous[0].direction @ axis) == pytest.approx(1.0, abs=1e-4)
     assert len(found.discrete) == flips
 
 
