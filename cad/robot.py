@@ -1,8 +1,8 @@
 """The UR5e: Denavit-Hartenberg table, forward and inverse kinematics, limits and link inertias.
 
 Frame ``base`` is UR's own base frame (z up); frame ``i`` follows joint ``i`` in the standard Denavit-Hartenberg
-convention, ``T_(i-1)_i = Rz(q) Tz(d) Tx(a) Rx(alpha)``; frame 6 is the flange, +z out of it. With all joints at zero
-the arm is stretched along -x.
+convention, ``T_(i-1)_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha)``; frame 6 is the flange, +z out of it. With all joints
+at zero the arm is stretched along -x.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from cad.parts import CadError
 from cad.primitives import Primitive, box_between, cylinder_between
-from cad.spatial import Array, inverse, wrap_angle
+from cad.spatial import Array, inverse, rotation_z, transform, wrap_angle
 
 
 class RobotModelError(CadError):
@@ -23,16 +23,21 @@ class RobotModelError(CadError):
 
 @dataclass(frozen=True, kw_only=True)
 class DhTable:
-    """Standard Denavit-Hartenberg parameters of a six-joint arm: ``a`` and ``d`` in metres, ``alpha`` in rad."""
+    """Standard Denavit-Hartenberg parameters of a six-joint arm: ``a``, ``d`` in metres, ``alpha``, ``theta`` in rad.
+
+    ``theta`` is added to the joints' encoder angles. A calibrated arm's middle axes are all but parallel, so its table
+    may hold ``d`` of hundreds of metres that cancel; :func:`link_frames` says where the links are.
+    """
 
     a: tuple[float, ...]
     d: tuple[float, ...]
     alpha: tuple[float, ...]
+    theta: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
-        lengths = (len(self.a), len(self.d), len(self.alpha))
-        if lengths != (6, 6, 6):
-            raise RobotModelError(f"a, d, alpha have {lengths} entries; each needs 6, one a joint")
+        for name, values in vars(self).items():
+            if len(values) != 6 or not np.isfinite(values).all():
+                raise RobotModelError(f"{name} = {values}: it needs 6 finite numbers, one a joint")
 
 
 UR5E = DhTable(
@@ -41,7 +46,7 @@ UR5E = DhTable(
     alpha=(np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0),
 )
 """Nominal UR5e: Universal Robots, "DH parameters for calculations of kinematics and dynamics". A real arm adds its own
-calibrated deltas of up to about a millimetre."""
+calibrated deltas (``cad.robot_calibration``), which move its flange by some millimetres."""
 
 JOINT_NAMES = (
     "shoulder_pan_joint",
@@ -60,7 +65,7 @@ BODY_NAMES = (
     "ur5e_wrist_2",
     "ur5e_wrist_3",
 )
-"""Body ``BODY_NAMES[i]`` is fixed to frame ``i``; ``ur5e_base`` to frame ``base``."""
+"""Body ``BODY_NAMES[i]`` is fixed to frame ``i`` of :func:`link_frames`; ``ur5e_base`` to frame ``base``."""
 
 JOINT_RANGE_RAD = (-2 * np.pi, 2 * np.pi)
 """Every joint turns +-360 degrees (UR5e data sheet)."""
@@ -149,7 +154,33 @@ def forward_kinematics(q: ArrayLike, dh: DhTable = UR5E) -> Array:
     frames = np.empty((7, 4, 4))
     frames[0] = np.eye(4)
     for i in range(6):
-        frames[i + 1] = frames[i] @ _dh_transform(angles[i], dh, i)
+        frames[i + 1] = frames[i] @ _dh_transform(angles[i] + dh.theta[i], dh, i)
+    return frames
+
+
+def rest_frames(dh: DhTable = UR5E) -> Array:
+    """Frames ``T_base_link`` (7, 4, 4) that the links' solids are fixed to, with all encoders at zero.
+
+    Frame ``i`` (0..5) has its z on the axis of joint ``i + 1`` of ``dh`` and is otherwise as near as can be to frame
+    ``i`` of the nominal arm, so that a link stays where it is when a calibrated table puts its frame far away along the
+    axis. Frame 6 is the flange exactly. For the nominal table these are the Denavit-Hartenberg frames.
+    """
+    nominal, exact = forward_kinematics(np.zeros(6)), forward_kinematics(np.zeros(6), dh)
+    frames = exact.copy()
+    for i in range(1, 6):
+        z, to_nominal = exact[i, :3, 2], nominal[i, :3, 3] - exact[i, :3, 3]
+        x = nominal[i, :3, 0] - z * (z @ nominal[i, :3, 0])
+        x /= np.linalg.norm(x)
+        frames[i] = transform(np.stack([x, np.cross(z, x), z], axis=1), exact[i, :3, 3] + z * (z @ to_nominal))
+    return frames
+
+
+def link_frames(q: ArrayLike, dh: DhTable = UR5E) -> Array:
+    """Frames ``T_base_link`` (7, 4, 4) of the links at ``q`` (6,) rad: :func:`rest_frames` turned about the joints."""
+    angles, rest = _joint_vector(q), rest_frames(dh)
+    frames = rest.copy()
+    for i in range(6):
+        frames[i + 1] = frames[i] @ transform(rotation_z(angles[i])) @ inverse(rest[i]) @ rest[i + 1]
     return frames
 
 
@@ -199,11 +230,11 @@ def _dh_transform(angle: float, dh: DhTable, i: int) -> Array:
 
 
 def _check_family(dh: DhTable) -> None:
-    zeros = (dh.a[0], *dh.a[3:], dh.d[1], dh.d[2])
+    zeros = (dh.a[0], *dh.a[3:], dh.d[1], dh.d[2], *dh.theta)
     if any(zeros) or not np.allclose(dh.alpha, UR5E.alpha, rtol=0, atol=1e-12):
         raise RobotModelError(
-            f"no closed form for a={dh.a}, d={dh.d}, alpha={dh.alpha}: a[0], a[3:], d[1], d[2] must be 0 and alpha "
-            f"{UR5E.alpha}; use a numeric solver for calibrated tables"
+            f"no closed form for {dh}: a[0], a[3:], d[1], d[2] and theta must be 0 and alpha {UR5E.alpha}; "
+            "use a numeric solver for calibrated tables"
         )
 
 

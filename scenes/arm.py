@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from cad import gripper, robot
-from cad.spatial import Array, quat_wxyz_from_rotation, rotation_x
+from cad.spatial import Array, inverse, quat_wxyz_from_rotation
 from scenes.contacts import ROBOT, Touches, add_primitive, pad_contact
 from scenes.gl import mujoco
+
+Input = mujoco.mjtCtrlInput
 
 SHOULDER_GAINS, WRIST_GAINS = (20000.0, 800.0), (5000.0, 100.0)
 """(kp N m/rad, kv N m s/rad) of the joint servos: stiff enough for a static error of the tcp below 0.1 um."""
@@ -15,15 +17,22 @@ JOINT_ARMATURE = 0.1
 """kg m^2 of rotor and harmonic drive, seen from the joint (ours: UR publishes none). Without it the wrists' damping
 outweighs their inertia within a time step, and a part in the hand feels accelerations that the hand does not make:
 carried over 0.4 m it slips by up to 1.2 mm instead of 0.03 mm."""
-HAND_KP = 10000.0
-"""N/m of opening; the opening is the sum of both fingers' slides."""
+HAND_KP = 100000.0
+"""N/m of opening, the sum of both fingers' slides: the smallest force is reached 0.2 mm short of the commanded opening,
+the largest 1.3 mm short."""
 FINGER_DAMPING, FINGER_ARMATURE = 20.0, 0.05
+FINGER_JOINTS = ("hande_left", "hande_right")
 GRIPPER_ACTUATOR = "hande"
+FORCE_NUMERIC, SPEED_NUMERIC = "hande_force_range_n", "hande_speed_range_m_s"
+"""Custom numerics of the model: the ranges (low, high) of the hand's force and speed commands."""
 
 
-def add_arm(spec: mujoco.MjSpec, *, timestep_s: float, grip_force_n: float) -> None:
-    """Add arm and hand to a spec's world, whose frame is ``base``, with their joints, actuators and sites."""
-    links = _add_links(spec)
+def add_arm(spec: mujoco.MjSpec, dh: robot.DhTable, *, timestep_s: float, grip_force_n: float) -> None:
+    """Add arm and hand to a spec's world, whose frame is ``base``, with their joints, actuators and sites.
+
+    ``dh`` is the arm's kinematic table; ``grip_force_n`` the hand's force until it is commanded another.
+    """
+    links = _add_links(spec, dh)
     _add_arm_actuators(spec)
     flange = links[-1]
     flange.add_site(name="flange", group=4)
@@ -33,12 +42,13 @@ def add_arm(spec: mujoco.MjSpec, *, timestep_s: float, grip_force_n: float) -> N
         add_primitive(spec.body(solid.body), solid, Touches.ROBOT, contact)
 
 
-def _add_links(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
-    """Bodies whose frames are the Denavit-Hartenberg frames; body i turns about z of frame i - 1."""
+def _add_links(spec: mujoco.MjSpec, dh: robot.DhTable) -> list[mujoco.MjsBody]:
+    """Bodies whose frames are ``robot.link_frames``; body i turns about z of frame i - 1."""
     links = [spec.worldbody.add_body(name=robot.BODY_NAMES[0], gravcomp=1.0)]
-    dh = robot.UR5E
+    rest = robot.rest_frames(dh)
     for i in range(6):
-        offset, R = np.array([dh.a[i], 0.0, dh.d[i]]), rotation_x(dh.alpha[i])
+        T = inverse(rest[i]) @ rest[i + 1]
+        R, offset = T[:3, :3], T[:3, 3]
         body = links[-1].add_body(
             name=robot.BODY_NAMES[i + 1], pos=offset, quat=quat_wxyz_from_rotation(R), gravcomp=1.0
         )
@@ -67,15 +77,31 @@ def set_inertia(body: mujoco.MjsBody, mass_kg: float, com_m: Array | tuple, mome
 
 
 def _add_arm_actuators(spec: mujoco.MjSpec) -> None:
-    """Position servos with velocity damping: ctrl = q + (kv / kp) qd adds velocity feed-forward."""
+    """Servos with three inputs each: position, speed and torque feed-forward, all clamped to the arm's limits."""
     for i, name in enumerate(robot.JOINT_NAMES):
         kp, kv = SHOULDER_GAINS if i < 3 else WRIST_GAINS
-        limit = robot.TORQUE_LIMIT_NM[i]
+        speed, torque = robot.SPEED_LIMIT_RAD_S[i], robot.TORQUE_LIMIT_NM[i]
         actuator = spec.add_actuator(
-            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, forcerange=[-limit, limit]
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            ctrlrange=robot.JOINT_RANGE_RAD,
+            velrange=[-speed, speed],
+            ffrange=[-torque, torque],
+            forcerange=[-torque, torque],
         )
-        actuator.set_to_position(kp=kp, kv=kv)
-        actuator.forcelimited = True
+        actuator.set_to_pid(kp=kp, kv=kv, ctrlspec=int(Input.mjINPUT_POS | Input.mjINPUT_VEL | Input.mjINPUT_FF))
+        actuator.ctrllimited = actuator.forcelimited = True
+
+
+def arm_inputs(model: mujoco.MjModel) -> Array:
+    """Indices (3, 6) into ``data.ctrl``: the joints' position (rad), speed (rad/s) and torque (N m) set points."""
+    return np.array([model.actuator_ctrladr[model.actuator(name).id] + np.arange(3) for name in robot.JOINT_NAMES]).T
+
+
+def hand_inputs(model: mujoco.MjModel) -> Array:
+    """Indices (2,) into ``data.ctrl``: the opening (m) and its speed (m/s) that the hand is sent to."""
+    return model.actuator_ctrladr[model.actuator(GRIPPER_ACTUATOR).id] + np.arange(2)
 
 
 def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, grip_force_n: float) -> None:
@@ -87,8 +113,8 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, grip_force_n: float) 
     )
     set_inertia(base, gripper.BODY_MASS_KG + gripper.COUPLING_MASS_KG, com, gripper.BODY_MOMENTS_KG_M2)
     base.add_site(name="tcp", pos=gripper.T_FLANGE_TCP[:3, 3], group=4)
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        _add_finger(base, f"hande_{side}", sign)
+    for name, sign in zip(FINGER_JOINTS, (1.0, -1.0), strict=True):
+        _add_finger(base, name, sign)
     _couple_fingers(spec, grip_force_n)
 
 
@@ -123,14 +149,17 @@ def _couple_fingers(spec: mujoco.MjSpec, grip_force_n: float) -> None:
         solimp=[0.99, 0.999, 1e-4, 0.5, 2.0],
     )
     tendon = spec.add_tendon(name="hande_opening")
-    tendon.wrap_joint("hande_left", 1.0)
-    tendon.wrap_joint("hande_right", 1.0)
+    for name in FINGER_JOINTS:
+        tendon.wrap_joint(name, 1.0)
     actuator = spec.add_actuator(
         name=GRIPPER_ACTUATOR,
         target="hande_opening",
         trntype=mujoco.mjtTrn.mjTRN_TENDON,
         ctrlrange=[0.0, gripper.STROKE_M],
+        velrange=[-gripper.SPEED_RANGE_M_S[1], gripper.SPEED_RANGE_M_S[1]],
         forcerange=[-grip_force_n, grip_force_n],
     )
-    actuator.set_to_position(kp=HAND_KP, dampratio=1.0)
+    actuator.set_to_pid(kp=HAND_KP, dampratio=1.0, ctrlspec=int(Input.mjINPUT_POS | Input.mjINPUT_VEL))
     actuator.ctrllimited = actuator.forcelimited = True
+    spec.add_numeric(name=FORCE_NUMERIC, data=gripper.FORCE_RANGE_N)
+    spec.add_numeric(name=SPEED_NUMERIC, data=gripper.SPEED_RANGE_M_S)

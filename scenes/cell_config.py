@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cad.gripper import FORCE_RANGE_N
+from cad.robot import UR5E, DhTable
 from cad.spatial import BASLER, Array, Intrinsics, inverse, rotation_x, rotation_z, transform
 from cad.station import BOOM_REACH_M, TRAY_SIZE_M
 from cad.tagboard import TagboardConfig
@@ -52,6 +53,7 @@ class CellConfig:
 
     ``pick_area_half_m`` are the half extents, in the board's frame, of the area that parts are dropped into.
     ``home_q`` (6,) rad keeps arm and hand out of the camera's sight. ``grip_force_n`` is the hand's force at the start.
+    ``arm`` is the arm's kinematic table: nominal, or one calibrated arm's (``cad.robot_calibration``).
     """
 
     tagboard: TagboardConfig = field(default_factory=TagboardConfig)
@@ -61,6 +63,7 @@ class CellConfig:
     camera_height_m: float = 0.70
     intrinsics: Intrinsics = BASLER
     tray: TrayConfig = field(default_factory=TrayConfig)
+    arm: DhTable = UR5E
     home_q: tuple[float, ...] = (-2.396, -1.968, 1.988, -1.591, -1.571, 0.746)
     grip_force_n: float = FORCE_RANGE_N[0]
     timestep_s: float = 0.0005

@@ -195,7 +195,7 @@ def _add_station(spec: mujoco.MjSpec, config: CellConfig) -> None:
 
 
 def _add_robot(spec: mujoco.MjSpec, config: CellConfig) -> None:
-    add_arm(spec, timestep_s=config.timestep_s, grip_force_n=config.grip_force_n)
+    add_arm(spec, config.arm, timestep_s=config.timestep_s, grip_force_n=config.grip_force_n)
 
 
 def _add_cell_visuals(spec: mujoco.MjSpec, config: CellConfig) -> None:

@@ -1,7 +1,7 @@
 """Inverse kinematics of the arm: the closed form picks the branch, mink brings the TCP exactly onto the pose.
 
-Frame ``base`` is the arm model's world. The closed form knows the nominal arm; mink works on the model itself, so an
-arm model with calibrated lengths is solved exactly too.
+Frame ``base`` is the arm model's world. The closed form knows the nominal arm; mink works on the model itself, so a
+calibrated arm is solved exactly too.
 """
 
 from __future__ import annotations
@@ -17,9 +17,13 @@ from cad.robot import JOINT_NAMES, forward_kinematics, inverse_kinematics
 from cad.spatial import Array, inverse, rotation_angle, rotvec_from_rotation, transform
 from twin.robot import TwinError
 
-TCP_SITE = "tcp"
+TCP_SITE, FLANGE_SITE = "tcp", "flange"
 BRANCH_WEIGHTS = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 1.0])
 """What a radian of each joint counts for when the nearest branch is chosen: big links outweigh a turn of the wrist."""
+
+
+NOMINAL_TOLERANCE_M = 0.03
+"""A calibrated arm's flange lies at most this far from the nominal one's; real ones differ by some millimetres."""
 
 
 class IkError(TwinError):
@@ -48,7 +52,8 @@ class IkConfig:
 class ArmIk:
     """Forward and inverse kinematics of the TCP on the arm-only model.
 
-    ``model`` holds the arm's six joints by name and a site ``tcp``; ``q_home`` (6,) rad says which branch is preferred.
+    ``model`` holds the arm's six joints by name, nominal or calibrated, and the sites ``flange`` and ``tcp``;
+    ``q_home`` (6,) rad says which branch is preferred. Raises IkError for a model of another arm or tool.
     """
 
     def __init__(self, model: mujoco.MjModel, q_home: Array, config: IkConfig | None = None) -> None:
@@ -66,12 +71,18 @@ class ArmIk:
             TCP_SITE, "site", position_cost=1.0, orientation_cost=0.1, lm_damping=self._config.lm_damping
         )
         self._limits = [mink.ConfigurationLimit(model)]
-        # where the model's TCP differs from the nominal chain, the closed form aims at a flange shifted by as much
-        self._T_flange_tcp = inverse(forward_kinematics(self._q_home)[6]) @ self.forward(self._q_home)
-        if not np.allclose(self._T_flange_tcp, T_FLANGE_TCP, atol=5e-3):
+        T_base_flange = self._frame(FLANGE_SITE, self._q_home)
+        off_m = np.linalg.norm((T_base_flange - forward_kinematics(self._q_home)[6])[:3, 3])
+        if off_m > NOMINAL_TOLERANCE_M:
             raise IkError(
-                f"the arm model's TCP lies at {self._T_flange_tcp[:3, 3]} m in the flange frame, the gripper's at "
-                f"{T_FLANGE_TCP[:3, 3]} m: the model is of another tool or its base is not at the origin"
+                f"the arm model's flange is {1e3 * off_m:.1f} mm from where the nominal arm's is: the model is of "
+                "another arm or its base is not at the origin"
+            )
+        T_flange_tcp = inverse(T_base_flange) @ self.forward(self._q_home)
+        if not np.allclose(T_flange_tcp, T_FLANGE_TCP, atol=1e-6):
+            raise IkError(
+                f"the arm model's TCP lies at {T_flange_tcp[:3, 3]} m in the flange frame, the gripper's at "
+                f"{T_FLANGE_TCP[:3, 3]} m: the model is of another tool"
             )
 
     @property
@@ -81,8 +92,7 @@ class ArmIk:
 
     def forward(self, q: Array) -> Array:
         """``T_base_tcp`` (4, 4) at joint angles ``q`` (6,) rad."""
-        self._set(q)
-        return self._configuration.get_transform_frame_to_world(TCP_SITE, "site").as_matrix()
+        return self._frame(TCP_SITE, q)
 
     def jacobian(self, q: Array) -> Array:
         """Jacobian (6, 6) of the TCP in ``base``: rows are linear (m/rad), then angular velocity."""
@@ -100,7 +110,7 @@ class ArmIk:
         if not np.isfinite(T_base_tcp).all():
             raise IkError(f"the asked tool pose is not finite: {np.array2string(T_base_tcp, precision=4)}")
         near = self._q_home if q_near is None else np.asarray(q_near, dtype=np.float64)
-        branches = inverse_kinematics(T_base_tcp @ inverse(self._T_flange_tcp), q6_singular=float(near[5]))
+        branches = inverse_kinematics(T_base_tcp @ inverse(T_FLANGE_TCP), q6_singular=float(near[5]))
         branches = self._lower + (branches - self._lower) % (2 * np.pi)
         branches = branches[(branches <= self._upper).all(axis=1)]
         if not len(branches):
@@ -125,6 +135,10 @@ class ArmIk:
             f"{_describe(T_base_tcp)} was not reached in {self._config.max_iterations} iterations: "
             f"{distance * 1e3:.4f} mm and {np.degrees(angle):.4f} degrees are left"
         )
+
+    def _frame(self, site: str, q: Array) -> Array:
+        self._set(q)
+        return self._configuration.get_transform_frame_to_world(site, "site").as_matrix()
 
     def _set(self, q: Array) -> None:
         qpos = self._configuration.data.qpos.copy()

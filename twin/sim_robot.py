@@ -14,14 +14,12 @@ from scipy.interpolate import CubicSpline
 
 from cad import gripper, robot
 from cad.spatial import Array
+from scenes.arm import FINGER_JOINTS, GRIPPER_ACTUATOR, arm_inputs, hand_inputs
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_arm
 from twin.ik import ArmIk, IkConfig, IkError
 from twin.profiles import JointPath, LinearPath, sample_times, steps_per_period
 from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
-
-GRIPPER_ACTUATOR = "hande"
-FINGER_JOINTS = ("hande_left", "hande_right")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,16 +79,14 @@ class SimRobot:
         joints = [model.joint(name) for name in robot.JOINT_NAMES]
         self._qpos = np.array([j.qposadr[0] for j in joints])
         self._dofs = np.array([j.dofadr[0] for j in joints])
-        actuators = np.array([model.actuator(name).id for name in robot.JOINT_NAMES])
-        self._ctrl = model.actuator_ctrladr[actuators]
-        self._kp, self._kv = model.actuator_gainprm[actuators, 0], -model.actuator_biasprm[actuators, 2]
+        self._arm_inputs = arm_inputs(model)
         self._fingers = np.array([model.joint(name).qposadr[0] for name in FINGER_JOINTS])
         self._finger_dofs = np.array([model.joint(name).dofadr[0] for name in FINGER_JOINTS])
         self._hand = model.actuator(GRIPPER_ACTUATOR).id
-        self._hand_ctrl = int(model.actuator_ctrladr[self._hand])
+        self._hand_inputs = hand_inputs(model)
         self._inertia = np.zeros(model.nv)
         self._opening_target = self._opening
-        data.ctrl[self._hand_ctrl] = self._opening_target
+        data.ctrl[self._hand_inputs] = self._opening_target, 0.0
         self._q_target = data.qpos[self._qpos].copy()
         self._command(self._q_target, np.zeros(6), np.zeros(6))
 
@@ -144,12 +140,14 @@ class SimRobot:
         """See :class:`twin.robot.Robot`. The commanded opening runs at ``speed``, the fingers push with ``force_n``."""
         self._check_grip(opening_m, force_n, speed)
         self._model.actuator_forcerange[self._hand] = [-force_n, force_n]
-        start, period_s = float(self._data.ctrl[self._hand_ctrl]), self._config.control_period_s
+        start, period_s = float(self._data.ctrl[self._hand_inputs[0]]), self._config.control_period_s
         distance = opening_m - start
         self._opening_target = opening_m
         for time_s in sample_times(abs(distance) / speed, period_s):
-            self._data.ctrl[self._hand_ctrl] = start + np.sign(distance) * min(abs(distance), speed * time_s)
+            gone = np.sign(distance) * min(abs(distance), speed * time_s)
+            self._data.ctrl[self._hand_inputs] = start + gone, np.sign(distance) * speed
             self._period()
+        self._data.ctrl[self._hand_inputs] = opening_m, 0.0
         rest_s = waited_s = 0.0
         while rest_s < self._config.grip_rest_s:
             if waited_s > self._config.grip_limit_s:
@@ -168,7 +166,7 @@ class SimRobot:
         self._q_target = self._data.qpos[self._qpos].copy()
         self._command(self._q_target, np.zeros(6), np.zeros(6))
         self._opening_target = self._opening
-        self._data.ctrl[self._hand_ctrl] = self._opening_target
+        self._data.ctrl[self._hand_inputs] = self._opening_target, 0.0
 
     def wait(self, duration_s: float) -> None:
         """Let simulated time pass while the robot holds still."""
@@ -200,11 +198,11 @@ class SimRobot:
         self._check_finite()
 
     def _command(self, q: Array, qd: Array, qdd: Array) -> None:
-        """Set points of the servos, whose force is ``kp (ctrl - q) - kv qd``: speed and inertia are fed forward."""
+        """Set points of the servos; the torque that the acceleration needs is fed forward."""
         acceleration = np.zeros(self._model.nv)
         acceleration[self._dofs] = qdd
         mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
-        self._data.ctrl[self._ctrl] = q + (self._kv * qd + self._inertia[self._dofs]) / self._kp
+        self._data.ctrl[self._arm_inputs] = q, qd, self._inertia[self._dofs]
 
     def _period(self) -> None:
         """One control period of physics."""

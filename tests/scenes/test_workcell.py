@@ -6,7 +6,7 @@ import pytest
 from cad import gripper, robot
 from cad.parts import PartError, load_part
 from cad.spatial import apply, inverse, rotation_z, transform
-from scenes.arm import GRIPPER_ACTUATOR
+from scenes.arm import arm_inputs, hand_inputs
 from scenes.cell_config import TrayConfig
 from scenes.contacts import BOX, PART, Touches, make_collision
 from scenes.errors import SceneError
@@ -20,37 +20,6 @@ NAMES = ("inserted", "main", "top")
 @pytest.fixture(scope="module")
 def cell():
     return build_workcell(CONFIG, NAMES).compile()
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return build_arm(CONFIG).compile()
-
-
-def test_forward_kinematics_of_the_compiled_arm_are_the_published_ones(arm):
-    data, rng = mujoco.MjData(arm), np.random.default_rng(0)
-    for q in rng.uniform(-np.pi, np.pi, (20, 6)):
-        data.qpos[:6] = q
-        mujoco.mj_kinematics(arm, data)
-        for name, T in zip(robot.BODY_NAMES, robot.forward_kinematics(q), strict=True):
-            body = data.body(name)
-            np.testing.assert_allclose(body.xpos, T[:3, 3], atol=1e-9)
-            np.testing.assert_allclose(body.xmat.reshape(3, 3), T[:3, :3], atol=1e-9)
-        T_tcp = robot.forward_kinematics(q)[6] @ gripper.T_FLANGE_TCP
-        np.testing.assert_allclose(data.site("tcp").xpos, T_tcp[:3, 3], atol=1e-9)
-
-
-def test_compiled_masses_and_limits_are_the_published_ones(arm):
-    for i, inertia in enumerate(robot.LINK_INERTIAS):
-        body = arm.body(robot.BODY_NAMES[i + 1])
-        np.testing.assert_allclose(body.mass, inertia.mass_kg)
-        np.testing.assert_allclose(body.ipos, inertia.com_m)
-        limit = robot.TORQUE_LIMIT_NM[i]
-        np.testing.assert_allclose(arm.actuator(robot.JOINT_NAMES[i]).forcerange, [-limit, limit])
-        np.testing.assert_allclose(arm.joint(robot.JOINT_NAMES[i]).range, robot.JOINT_RANGE_RAD)
-    hand = sum(arm.body(name).mass[0] for name in ("hande_base", "hande_left", "hande_right"))
-    np.testing.assert_allclose(hand, gripper.HAND_MASS_KG)
-    np.testing.assert_allclose(arm.actuator(GRIPPER_ACTUATOR).ctrlrange, [0, gripper.STROKE_M])
 
 
 def test_parts_weigh_what_their_folders_say(cell):
@@ -74,7 +43,7 @@ def test_arm_leads_the_state_and_names_are_as_agreed(cell):
 
 def test_arm_holds_still_at_home_without_touching_anything(cell):
     data = mujoco.MjData(cell)
-    data.qpos[:6] = data.ctrl[:6] = CONFIG.home_q
+    data.qpos[:6] = data.ctrl[arm_inputs(cell)[0]] = CONFIG.home_q
     mujoco.mj_step(cell, data, 400)
     np.testing.assert_allclose(data.qpos[:6], CONFIG.home_q, atol=1e-6)
     touching = {cell.geom(g).name for c in data.contact for g in (c.geom1, c.geom2)}
@@ -100,7 +69,7 @@ def test_arm_is_stopped_by_the_board(cell):
     data = mujoco.MjData(cell)
     T = CONFIG.T_world_board @ transform(np.diag([1.0, -1.0, -1.0]), [0, 0, -0.002]) @ inverse(gripper.T_FLANGE_TCP)
     q = min(robot.inverse_kinematics(T), key=lambda q: np.abs(q - CONFIG.home_q).sum())
-    data.qpos[:6] = data.ctrl[:6] = q
+    data.qpos[:6] = data.ctrl[arm_inputs(cell)[0]] = q
     mujoco.mj_forward(cell, data)
     pairs = [{cell.geom(c.geom1).name, cell.geom(c.geom2).name} for c in data.contact]
     assert {"board", "pad_left"} in pairs
@@ -117,7 +86,7 @@ def test_nests_are_flat_places_on_the_tray_one_row_a_class():
 
 def test_part_in_a_nest_stays_where_it_was_put(cell):
     data = mujoco.MjData(cell)
-    data.qpos[:6] = data.ctrl[:6] = CONFIG.home_q
+    data.qpos[:6] = data.ctrl[arm_inputs(cell)[0]] = CONFIG.home_q
     T = np.stack([CONFIG.nest_frames(n)[0] @ load_part(n).stable_poses[0].T_table_part for n in NAMES])
     set_parts(cell, data, T)
     mujoco.mj_step(cell, data, 400)
@@ -163,12 +132,13 @@ def test_hand_lifts_a_box_of_a_third_of_a_gram():
         return min(found, key=lambda q: np.abs(q - CONFIG.home_q).sum())
 
     low, high = solve(0.0006), solve(0.0506)
-    data.qpos[:6] = data.ctrl[:6] = low
+    positions, hand = arm_inputs(model)[0], hand_inputs(model)[0]
+    data.qpos[:6] = data.ctrl[positions] = low
     data.qpos[6:8] = 0.010
-    data.ctrl[6] = 0.020
+    data.ctrl[hand] = 0.020
     closing = round(0.20 / CONFIG.timestep_s)
     for step in range(closing):
-        data.ctrl[6] = max(0.0, 0.020 - 0.1 * step * CONFIG.timestep_s)
+        data.ctrl[hand] = max(0.0, 0.020 - 0.1 * step * CONFIG.timestep_s)
         mujoco.mj_step(model, data)
     opening = data.qpos[6] + data.qpos[7]
     assert abs(opening - 0.008) < 5e-5
@@ -176,7 +146,7 @@ def test_hand_lifts_a_box_of_a_third_of_a_gram():
     before = data.body("box").xpos - data.site("tcp").xpos
     for step in range(rising):
         s = (step + 1) / rising
-        data.ctrl[:6] = low + (high - low) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        data.ctrl[positions] = low + (high - low) * (10 * s**3 - 15 * s**4 + 6 * s**5)
         mujoco.mj_step(model, data)
     mujoco.mj_step(model, data, 100)
     assert data.body("box").xpos[2] > 0.05
