@@ -1,4 +1,4 @@
-"""Triangle meshes of parts: reading sources, checking, merging, sampling and writing. Metres throughout."""
+"""Triangle meshes of parts: checking, merging, sampling and writing. Metres throughout."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from numpy.typing import ArrayLike
 from cad.parts import CadError
 from cad.spatial import Array
 
-METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 25.4e-3}
-MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off")
-CAD_SUFFIXES = (".step", ".stp")
 DEFLECTION_MM = 0.002
 """Largest distance in mm between a curved CAD surface and its triangles."""
 ANGULAR_DEFLECTION_RAD = 0.12
@@ -53,29 +50,6 @@ def check_mesh(mesh: trimesh.Trimesh, name: str = "mesh") -> None:
         raise MeshError(f"{name} has volume {mesh.volume:.3g} m3; turn its normals outwards")
 
 
-def read_source(path: Path, unit: str = "mm") -> trimesh.Trimesh:
-    """A checked mesh in metres from a STEP, STL, OBJ, OFF or PLY file whose numbers are in ``unit``.
-
-    STEP files carry their own unit and need the extra ``cad``. Raises MeshError for unknown suffixes and units, files
-    that are not there and meshes that bound no solid.
-    """
-    if unit not in METRES_PER_UNIT:
-        raise MeshError(f"unit {unit!r} is unknown; use one of {', '.join(METRES_PER_UNIT)}")
-    if not path.is_file():
-        raise MeshError(f"there is no file {path}")
-    suffix = path.suffix.lower()
-    if suffix in CAD_SUFFIXES:
-        return _read_step(path)
-    if suffix not in MESH_SUFFIXES:
-        raise MeshError(f"{path} has suffix {suffix!r}; use one of {', '.join(CAD_SUFFIXES + MESH_SUFFIXES)}")
-    try:
-        raw = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, IndexError, TypeError, NotImplementedError) as error:
-        raise MeshError(f"{path} cannot be read as {suffix}: {error}") from error
-    assert isinstance(raw, trimesh.Trimesh)
-    return mesh_from_triangles(raw.vertices * METRES_PER_UNIT[unit], raw.faces, str(path))
-
-
 def write_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     """Write a binary PLY with vertices and triangles only; the same mesh gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,16 +76,3 @@ def distance_to_surface(mesh: trimesh.Trimesh, points: Array) -> Array:
     chunks = [scale * points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
     found = [trimesh.proximity.closest_point_naive(unit, chunk)[1] for chunk in chunks]
     return np.concatenate([np.empty(0), *found]) / scale
-
-
-def _read_step(path: Path) -> trimesh.Trimesh:
-    try:
-        from build123d import import_step  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise MeshError(f"reading {path} needs a CAD kernel: pip install 'tagcell[cad]'") from error
-    try:
-        shape = import_step(path)
-    except (ValueError, RuntimeError) as error:
-        raise MeshError(f"{path} cannot be read as STEP: {error}") from error
-    vertices, triangles = shape.tessellate(DEFLECTION_MM, ANGULAR_DEFLECTION_RAD)
-    return mesh_from_triangles([[1e-3 * v.X, 1e-3 * v.Y, 1e-3 * v.Z] for v in vertices], triangles, str(path))

@@ -1,0 +1,126 @@
+"""Takes in a part's file as it comes: unit, size, repair, union. The result is one watertight mesh in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from cad.meshes import MeshError, check_mesh
+from cad.soup import Soup
+from cad.sources import CAD_SUFFIXES, read_bytes, read_triangles
+from cad.step import declared_unit, read_step
+from cad.surface import outer_surface
+
+METRES_PER_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "in": 25.4e-3, "ft": 304.8e-3}
+"""The units of length that files come in."""
+_REPORTED = 1e-3  # smallest share of the volume whose filling is worth a line
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntakeConfig:
+    """What is taken in without a question, and how closely.
+
+    ``size_mm``: range of the largest side of the bounding box that a part may have without ``accept_size``. The Hand-E
+    opens 50 mm, so nothing longer can be taken at any angle, and the camera sees 1 mm as 20 to 40 pixels, too few for
+    a pose. A part of 1 to 50 mm whose numbers are taken for inches or metres, or the other way round, falls outside.
+
+    ``gap_m``: gaps in a surface up to this width are closed by moving vertices; wider ones are filled.
+
+    ``triangles``: a surface of more is simplified, no point moving further than ``simplify_m``.
+
+    ``wrap_cells``: cells along the longest side of a surface that cannot be repaired and is wrapped instead.
+    """
+
+    size_mm: tuple[float, float] = (1.0, 50.0)
+    gap_m: float = 10e-6
+    triangles: int = 20_000
+    simplify_m: float = 2e-6
+    wrap_cells: int = 160
+    time_limit_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        low, high = self.size_mm
+        if not 0 < low < high:
+            raise ValueError(f"size_mm {self.size_mm}: two sizes in mm, the smaller first")
+        for key in ("gap_m", "simplify_m", "time_limit_s"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} {getattr(self, key)}: it must be positive")
+        if self.triangles < 4 or not 16 <= self.wrap_cells <= 512:
+            raise ValueError(f"triangles {self.triangles} (4 or more), wrap_cells {self.wrap_cells} (16 to 512)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intake:
+    """A part as it was taken in.
+
+    ``mesh`` is the outer surface of the union of all solids, watertight, in metres, in the file's frame; ``solids`` is
+    how many closed shells the file holds; ``unit`` is what the file's numbers are in and ``unit_source`` how that is
+    known; ``size_mm`` (3,) is the bounding box; ``notes`` say, for a person to read, what was changed and how much.
+    """
+
+    mesh: trimesh.Trimesh
+    solids: int
+    unit: str
+    unit_source: str
+    size_mm: tuple[float, float, float]
+    notes: tuple[str, ...]
+
+
+def read_part(
+    path: Path, *, unit: str | None = None, accept_size: bool = False, config: IntakeConfig | None = None
+) -> Intake:
+    """Take in a STEP, STL, OBJ, PLY or OFF file.
+
+    ``unit`` is what the file's numbers are in: STEP files say it themselves (``unit`` overrules them), meshes are
+    taken for millimetres. Nothing is written. Raises MeshError, in one line with the remedy, for a file that cannot be
+    read, a surface that bounds no volume, and a size that is implausible unless ``accept_size``.
+    """
+    config = config or IntakeConfig()
+    if unit is not None and unit not in METRES_PER_UNIT:
+        raise MeshError(f"unit {unit!r} is unknown; use one of {', '.join(METRES_PER_UNIT)}")
+    data, name = read_bytes(path), path.name
+    if path.suffix.lower() in CAD_SUFFIXES:
+        declared = declared_unit(data)
+        soups = read_step(data, name, time_limit_s=config.time_limit_s)
+        scale, unit, source = _step_scale(name, declared, unit)
+    else:
+        soups = read_triangles(data, path.suffix, name)
+        source = "as asked" if unit else "mesh files name no unit; millimetres are the custom"
+        unit = unit or "mm"
+        scale = METRES_PER_UNIT[unit]
+    soups = [Soup(vertices=scale * soup.vertices, faces=soup.faces) for soup in soups]
+    _check_size(name, soups, unit, accept_size, config)
+    mesh, solids, notes = outer_surface(soups, name, config)
+    check_mesh(mesh, name)
+    size = tuple(float(side) for side in 1e3 * mesh.extents)
+    return Intake(mesh=mesh, solids=solids, unit=unit, unit_source=source, size_mm=size, notes=tuple(notes))
+
+
+def _step_scale(name: str, declared: str | None, unit: str | None) -> tuple[float, str, str]:
+    """What the metres read from a STEP file are multiplied by, the unit, and how it is known."""
+    if unit is None:
+        return 1.0, declared or "mixed", "the file says so" if declared else "the file names its units"
+    if declared is None:
+        raise MeshError(f"{name} names several or unusual units of its own; leave --unit away")
+    return METRES_PER_UNIT[unit] / METRES_PER_UNIT[declared], unit, f"as asked (the file says {declared})"
+
+
+def _check_size(name: str, soups: list[Soup], unit: str, accept: bool, config: IntakeConfig) -> None:
+    corners = np.concatenate([soup.vertices[np.unique(soup.faces)] for soup in soups])
+    if not np.isfinite(corners).all():
+        raise MeshError(f"{name} has vertices that are not finite; export the part again")
+    size = 1e3 * float(np.ptp(corners, axis=0).max())
+    low, high = config.size_mm
+    if accept or low <= size <= high:
+        return
+    others = {other: size * factor / METRES_PER_UNIT.get(unit, 1e-3) for other, factor in METRES_PER_UNIT.items()}
+    listed = ", ".join(f"{value:.3g} mm if they are {other}" for other, value in others.items() if other != unit)
+    fitting = [other for other, value in others.items() if low <= value <= high and other != unit]
+    hint = f"--unit {fitting[0]}" if len(fitting) == 1 else f"--unit {'|'.join(METRES_PER_UNIT)}"
+    raise MeshError(
+        f"{name} is {size:.3g} mm long if its numbers are {unit}, but this cell picks parts of {low:g} to {high:g} mm; "
+        f"which unit is it ({listed})? Answer with {hint}, or with --accept-size if {size:.3g} mm is right"
+    )
