@@ -45,8 +45,8 @@ UR5E = DhTable(
     d=(0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996),
     alpha=(np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0),
 )
-"""Nominal UR5e: Universal Robots, "DH parameters for calculations of kinematics and dynamics". A real arm adds its own
-calibrated deltas (``cad.robot_calibration``), which move its flange by some millimetres."""
+"""Nominal UR5e: Universal Robots, "DH parameters for calculations of kinematics and dynamics" (support article). A real
+arm adds its own calibrated deltas (``cad.robot_calibration``), which move its flange by some millimetres."""
 
 JOINT_NAMES = (
     "shoulder_pan_joint",
@@ -68,15 +68,15 @@ BODY_NAMES = (
 """Body ``BODY_NAMES[i]`` is fixed to frame ``i`` of :func:`link_frames`; ``ur5e_base`` to frame ``base``."""
 
 JOINT_RANGE_RAD = (-2 * np.pi, 2 * np.pi)
-"""Every joint turns +-360 degrees (UR5e data sheet)."""
+"""+-360 degrees on every joint: Universal Robots, "UR5e user manual", technical specifications."""
 SPEED_LIMIT_RAD_S = (np.pi,) * 6
-"""180 degrees/s on every joint (UR5e data sheet)."""
+"""180 degrees/s on every joint: Universal Robots, "UR5e user manual", technical specifications."""
 TORQUE_LIMIT_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
-"""Maximum joint torques (Universal Robots, "Max. joint torques")."""
+"""Universal Robots, "Max. joint torques" (support article): joint size 3 of base, shoulder, elbow; size 1 of wrists."""
 PAYLOAD_KG = 5.0
-"""UR5e data sheet."""
+"""Universal Robots, "UR5e user manual", technical specifications."""
 REACH_M = 0.85
-"""UR5e data sheet."""
+"""Universal Robots, "UR5e user manual", technical specifications."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,17 +9,16 @@ from cad.spatial import Array, inverse, quat_wxyz_from_rotation
 from scenes.contacts import ROBOT, Touches, add_primitive, pad_contact
 from scenes.gl import mujoco
 
-Input = mujoco.mjtCtrlInput
-
+SERVO_INPUTS = int(mujoco.mjtCtrlInput.mjINPUT_POS | mujoco.mjtCtrlInput.mjINPUT_VEL | mujoco.mjtCtrlInput.mjINPUT_FF)
+"""Every servo takes a position, a speed and a force: ``force = kp (position - x) + kv (speed - v) + feed-forward``."""
 SHOULDER_GAINS, WRIST_GAINS = (20000.0, 800.0), (5000.0, 100.0)
 """(kp N m/rad, kv N m s/rad) of the joint servos: stiff enough for a static error of the tcp below 0.1 um."""
 JOINT_ARMATURE = 0.1
 """kg m^2 of rotor and harmonic drive, seen from the joint (ours: UR publishes none). Without it the wrists' damping
 outweighs their inertia within a time step, and a part in the hand feels accelerations that the hand does not make:
 carried over 0.4 m it slips by up to 1.2 mm instead of 0.03 mm."""
-HAND_KP = 100000.0
-"""N/m of opening, the sum of both fingers' slides: the smallest force is reached 0.2 mm short of the commanded opening,
-the largest 1.3 mm short."""
+HAND_KP = 10000.0
+"""N/m of opening; the opening is the sum of both fingers' slides."""
 FINGER_DAMPING, FINGER_ARMATURE = 20.0, 0.05
 FINGER_JOINTS = ("hande_left", "hande_right")
 GRIPPER_ACTUATOR = "hande"
@@ -90,7 +89,7 @@ def _add_arm_actuators(spec: mujoco.MjSpec) -> None:
             ffrange=[-torque, torque],
             forcerange=[-torque, torque],
         )
-        actuator.set_to_pid(kp=kp, kv=kv, ctrlspec=int(Input.mjINPUT_POS | Input.mjINPUT_VEL | Input.mjINPUT_FF))
+        actuator.set_to_pid(kp=kp, kv=kv, ctrlspec=SERVO_INPUTS)
         actuator.ctrllimited = actuator.forcelimited = True
 
 
@@ -100,8 +99,8 @@ def arm_inputs(model: mujoco.MjModel) -> Array:
 
 
 def hand_inputs(model: mujoco.MjModel) -> Array:
-    """Indices (2,) into ``data.ctrl``: the opening (m) and its speed (m/s) that the hand is sent to."""
-    return model.actuator_ctrladr[model.actuator(GRIPPER_ACTUATOR).id] + np.arange(2)
+    """Indices (3,) into ``data.ctrl``: set points of the opening (m) and its speed (m/s), force feed-forward (N)."""
+    return model.actuator_ctrladr[model.actuator(GRIPPER_ACTUATOR).id] + np.arange(3)
 
 
 def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, grip_force_n: float) -> None:
@@ -157,9 +156,10 @@ def _couple_fingers(spec: mujoco.MjSpec, grip_force_n: float) -> None:
         trntype=mujoco.mjtTrn.mjTRN_TENDON,
         ctrlrange=[0.0, gripper.STROKE_M],
         velrange=[-gripper.SPEED_RANGE_M_S[1], gripper.SPEED_RANGE_M_S[1]],
+        ffrange=[-gripper.FORCE_RANGE_N[1], gripper.FORCE_RANGE_N[1]],
         forcerange=[-grip_force_n, grip_force_n],
     )
-    actuator.set_to_pid(kp=HAND_KP, dampratio=1.0, ctrlspec=int(Input.mjINPUT_POS | Input.mjINPUT_VEL))
+    actuator.set_to_pid(kp=HAND_KP, dampratio=1.0, ctrlspec=SERVO_INPUTS)
     actuator.ctrllimited = actuator.forcelimited = True
     spec.add_numeric(name=FORCE_NUMERIC, data=gripper.FORCE_RANGE_N)
     spec.add_numeric(name=SPEED_NUMERIC, data=gripper.SPEED_RANGE_M_S)

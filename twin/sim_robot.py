@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from cad import gripper, robot
+from cad import robot
 from cad.spatial import Array
-from scenes.arm import FINGER_JOINTS, GRIPPER_ACTUATOR, arm_inputs, hand_inputs
+from scenes.arm import arm_inputs
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_arm
 from twin.ik import ArmIk, IkConfig, IkError
-from twin.profiles import JointPath, LinearPath, sample_times, steps_per_period
-from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
+from twin.profiles import JointPath, LinearPath, sample, steps_per_period
+from twin.robot import JointMove, LinearMove, MotionRefused, RobotError, RobotState
+from twin.sim_hand import SimHand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +35,13 @@ class SimRobotConfig:
     """Largest values that a UR accepts for moves (ur_rtde's own guards)."""
     min_tcp_z_m: float = 0.0
     """The table: no target or path may bring the TCP below it."""
-    knot_spacing_m: float = 0.002
-    """Linear moves are solved this densely and interpolated by a cubic spline in between."""
+    knot_spacing_m: float = 0.005
+    """Linear moves are solved this densely; the cubic spline in between stays within 0.01 um of the line."""
     tracking_limit: float = 0.1
     """A joint further than this from its path means that something is in the way: a protective stop."""
     settle_error: float = 1e-5
     settle_speed: float = 1e-3
     settle_limit_s: float = 0.5
-    grip_reach_m: float = 0.3e-3
-    """An opening this close to the commanded one has been reached; otherwise the fingers hold something."""
-    grip_rest_speed: float = 0.5e-3
     grip_rest_s: float = 0.02
     grip_limit_s: float = 1.0
 
@@ -80,13 +78,8 @@ class SimRobot:
         self._qpos = np.array([j.qposadr[0] for j in joints])
         self._dofs = np.array([j.dofadr[0] for j in joints])
         self._arm_inputs = arm_inputs(model)
-        self._fingers = np.array([model.joint(name).qposadr[0] for name in FINGER_JOINTS])
-        self._finger_dofs = np.array([model.joint(name).dofadr[0] for name in FINGER_JOINTS])
-        self._hand = model.actuator(GRIPPER_ACTUATOR).id
-        self._hand_inputs = hand_inputs(model)
+        self._hand = SimHand(model, data)
         self._inertia = np.zeros(model.nv)
-        self._opening_target = self._opening
-        data.ctrl[self._hand_inputs] = self._opening_target, 0.0
         self._q_target = data.qpos[self._qpos].copy()
         self._command(self._q_target, np.zeros(6), np.zeros(6))
 
@@ -100,8 +93,8 @@ class SimRobot:
             q=q,
             qd=self._data.qvel[self._dofs].copy(),
             T_base_tcp=self._kinematics.forward(q),
-            opening_m=self._opening,
-            grip=self._grip_state(),
+            opening_m=self._hand.opening_m,
+            grip=self._hand.state,
         )
 
     def move_j(self, q: Array, *, speed: float, acceleration: float) -> JointMove:
@@ -111,7 +104,8 @@ class SimRobot:
         path = JointPath(q_start=self._q_target, q_end=target, speed=speed, acceleration=acceleration)
         for fraction in np.linspace(0.0, 1.0, 20):
             self._check_height(self._kinematics.forward(path.q_start + fraction * (target - path.q_start)))
-        self._follow(path.at, path.duration_s, target)
+        s, ds, dds = sample(path.profile, self._config.control_period_s)
+        self._follow(path.q_start + path.direction * s, path.direction * ds, path.direction * dds, target)
         return JointMove(q=target, speed=speed, acceleration=acceleration, duration_s=path.duration_s)
 
     def move_l(self, T_base_tcp: Array, *, speed: float, acceleration: float) -> LinearMove:
@@ -127,46 +121,33 @@ class SimRobot:
         profile = path.profile
         if profile.length > 0.0:
             spline = self._joint_spline(path)
-
-            def at(time_s: float) -> tuple[Array, Array, Array]:
-                s, ds, dds = (x / profile.length for x in profile.at(time_s))
-                slope = spline(s, 1)
-                return spline(s), slope * ds, spline(s, 2) * ds**2 + slope * dds
-
-            self._follow(at, profile.duration_s, spline(1.0))
+            s, ds, dds = sample(profile, self._config.control_period_s) / profile.length
+            slope, bend = spline(s[:, 0], 1), spline(s[:, 0], 2)
+            self._follow(spline(s[:, 0]), slope * ds, bend * ds**2 + slope * dds, spline(1.0))
         return LinearMove(T_base_tcp=target, speed=speed, acceleration=acceleration, duration_s=profile.duration_s)
 
     def grip(self, opening_m: float, *, force_n: float, speed: float) -> RobotState:
-        """See :class:`twin.robot.Robot`. The commanded opening runs at ``speed``, the fingers push with ``force_n``."""
-        self._check_grip(opening_m, force_n, speed)
-        self._model.actuator_forcerange[self._hand] = [-force_n, force_n]
-        start, period_s = float(self._data.ctrl[self._hand_inputs[0]]), self._config.control_period_s
-        distance = opening_m - start
-        self._opening_target = opening_m
-        for time_s in sample_times(abs(distance) / speed, period_s):
-            gone = np.sign(distance) * min(abs(distance), speed * time_s)
-            self._data.ctrl[self._hand_inputs] = start + gone, np.sign(distance) * speed
-            self._period()
-        self._data.ctrl[self._hand_inputs] = opening_m, 0.0
+        """See :class:`twin.robot.Robot`. Raises MotionRefused outside the hand's ranges."""
+        self._hand.go(opening_m, force_n=force_n, speed=speed)
+        travel_s = abs(opening_m - self._hand.opening_m) / speed
         rest_s = waited_s = 0.0
         while rest_s < self._config.grip_rest_s:
-            if waited_s > self._config.grip_limit_s:
+            if waited_s > travel_s + self._config.grip_limit_s:
                 raise RobotError(
                     f"the fingers did not come to rest within {self._config.grip_limit_s} s after being sent to "
-                    f"{1e3 * opening_m:.2f} mm; they are at {1e3 * self._opening:.2f} mm"
+                    f"{1e3 * opening_m:.2f} mm; they are at {1e3 * self._hand.opening_m:.2f} mm"
                 )
             self._period()
-            waited_s += period_s
-            rest_s = rest_s + period_s if self._finger_speed < self._config.grip_rest_speed else 0.0
+            waited_s += self._config.control_period_s
+            rest_s = rest_s + self._config.control_period_s if self._hand.at_rest else 0.0
         self._check_finite()
         return self.observe()
 
     def stop(self) -> None:
-        """Stop all motion now: the arm and the fingers hold where they are."""
+        """Stop all motion now: the arm holds where it is, and so do fingers that are not gripping anything."""
         self._q_target = self._data.qpos[self._qpos].copy()
         self._command(self._q_target, np.zeros(6), np.zeros(6))
-        self._opening_target = self._opening
-        self._data.ctrl[self._hand_inputs] = self._opening_target, 0.0
+        self._hand.stop()
 
     def wait(self, duration_s: float) -> None:
         """Let simulated time pass while the robot holds still."""
@@ -175,13 +156,12 @@ class SimRobot:
 
     # -- motion ---------------------------------------------------------------------------------------------------
 
-    def _follow(self, at: Callable[[float], tuple[Array, Array, Array]], duration_s: float, q_end: Array) -> None:
-        """Run along ``at`` (time -> q, qd, qdd, each (6,)) and settle at ``q_end`` (6,)."""
-        for time_s in sample_times(duration_s, self._config.control_period_s):
-            q, qd, qdd = at(time_s)
-            self._command(q, qd, qdd)
+    def _follow(self, q: Array, qd: Array, qdd: Array, q_end: Array) -> None:
+        """Run through the set points, one row (6,) a control period, and settle at ``q_end`` (6,)."""
+        for row in zip(q, qd, qdd, strict=True):
+            self._command(*row)
             self._period()
-            self._check_tracking(q)
+            self._check_tracking(row[0])
         self._q_target = q_end.copy()
         self._command(q_end, np.zeros(6), np.zeros(6))
         waited_s = 0.0
@@ -199,13 +179,17 @@ class SimRobot:
 
     def _command(self, q: Array, qd: Array, qdd: Array) -> None:
         """Set points of the servos; the torque that the acceleration needs is fed forward."""
-        acceleration = np.zeros(self._model.nv)
-        acceleration[self._dofs] = qdd
-        mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
-        self._data.ctrl[self._arm_inputs] = q, qd, self._inertia[self._dofs]
+        torque = qdd
+        if qdd.any():
+            acceleration = np.zeros(self._model.nv)
+            acceleration[self._dofs] = qdd
+            mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
+            torque = self._inertia[self._dofs]
+        self._data.ctrl[self._arm_inputs] = q, qd, torque
 
     def _period(self) -> None:
-        """One control period of physics."""
+        """One control period of the hand's controller and of physics."""
+        self._hand.advance(self._config.control_period_s)
         if self.on_step is None:
             mujoco.mj_step(self._model, self._data, self._steps)
             return
@@ -222,7 +206,8 @@ class SimRobot:
             T_base_tcp = path.at_share(float(share))
             self._check_height(T_base_tcp)
             try:
-                knots.append(self._kinematics.refine(T_base_tcp, knots[-1]))
+                ahead = 2 * knots[-1] - knots[-2] if len(knots) > 1 else knots[-1]
+                knots.append(self._kinematics.refine(T_base_tcp, ahead))
             except IkError as error:
                 raise MotionRefused(f"linear move refused: {error}") from error
         spline = CubicSpline(shares, knots)
@@ -234,25 +219,6 @@ class SimRobot:
             )
         return spline
 
-    # -- the hand -------------------------------------------------------------------------------------------------
-
-    @property
-    def _opening(self) -> float:
-        return float(self._data.qpos[self._fingers].sum())
-
-    @property
-    def _finger_speed(self) -> float:
-        return float(np.abs(self._data.qvel[self._finger_dofs]).sum())
-
-    def _grip_state(self) -> GripState:
-        """Object detection as the Hand-E does it: fingers that rest short of the commanded opening hold something."""
-        short = self._opening - self._opening_target
-        if abs(short) <= self._config.grip_reach_m:
-            return GripState.AT_POSITION
-        if self._finger_speed > 20 * self._config.grip_rest_speed:
-            return GripState.MOVING
-        return GripState.CONTACT_CLOSING if short > 0 else GripState.CONTACT_OPENING
-
     # -- checks ---------------------------------------------------------------------------------------------------
 
     def _settled(self, q_end: Array) -> bool:
@@ -262,7 +228,7 @@ class SimRobot:
 
     def _check_tracking(self, q: Array) -> None:
         off = np.abs(self._data.qpos[self._qpos] - q)
-        if not (off <= self._config.tracking_limit).all():
+        if not off.max() <= self._config.tracking_limit:
             self.stop()
             raise RobotError(
                 f"protective stop: joints are {off.round(3)} rad off their path, more than "
@@ -295,16 +261,6 @@ class SimRobot:
                 f"move refused: it would bring the TCP to z = {1e3 * z:.2f} mm, below the table at "
                 f"{1e3 * self._config.min_tcp_z_m:.2f} mm"
             )
-
-    def _check_grip(self, opening_m: float, force_n: float, speed: float) -> None:
-        checks = (
-            ("opening", opening_m, (0.0, gripper.STROKE_M), "m"),
-            ("force", force_n, gripper.FORCE_RANGE_N, "N"),
-            ("speed", speed, gripper.SPEED_RANGE_M_S, "m/s"),
-        )
-        for name, value, (low, high), unit in checks:
-            if not low <= value <= high:
-                raise MotionRefused(f"grip {name} {value} {unit} refused: the Hand-E's range is {low} to {high} {unit}")
 
 
 def _check_rates(what: str, speed: float, max_speed: float, acceleration: float, max_acceleration: float) -> None:

@@ -1,0 +1,125 @@
+"""The Hand-E's own controller in simulation: opening, speed and force as commanded, object detection from contact.
+
+Like the real hand it drives the fingers at the commanded speed; fingers that cannot follow are pushed with the
+commanded force until they can, or until another command comes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cad import gripper
+from scenes.arm import FINGER_JOINTS, GRIPPER_ACTUATOR, hand_inputs
+from scenes.gl import mujoco
+from twin.robot import GripState, MotionRefused
+
+REACH_M = 0.3e-3
+"""An opening this close to the commanded one has been reached. Fingers this far behind their set point have stalled."""
+REST_SPEED = 0.5e-3
+"""m/s of opening below which a grip is done."""
+STOPPED_SPEED = 10e-3
+"""m/s of opening up to which fingers count as stopped by what they press on: a hand that is carried about shivers."""
+TOUCH_SHARE = 0.5
+"""Contact counts once it takes up this share of the commanded force; both fingers together give twice that force."""
+
+
+class SimHand:
+    """The hand of a compiled cell. :meth:`advance` must be called once every control period, before the physics."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        joints = [model.joint(name) for name in FINGER_JOINTS]
+        self._qpos = np.array([j.qposadr[0] for j in joints])
+        self._dofs = np.array([j.dofadr[0] for j in joints])
+        self._bodies = np.array([j.bodyid[0] for j in joints])
+        self._signs = np.array([model.jnt_axis[j.id][0] for j in joints])
+        self._actuator = model.actuator(GRIPPER_ACTUATOR).id
+        self._inputs = hand_inputs(model)
+        self._target = self._set_point = self.opening_m
+        self._speed = gripper.SPEED_RANGE_M_S[0]
+        data.ctrl[self._inputs] = self._target, 0.0, 0.0
+
+    @property
+    def opening_m(self) -> float:
+        """Opening between the pads."""
+        return float(self._data.qpos[self._qpos].sum())
+
+    @property
+    def speed(self) -> float:
+        """Speed of both fingers together, m/s, not negative."""
+        return float(np.abs(self._data.qvel[self._dofs]).sum())
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the fingers have stopped: where they were sent, or stalled on the way."""
+        return self.speed < REST_SPEED and (self._stalled or self._set_point == self._target)
+
+    @property
+    def state(self) -> GripState:
+        """The hand's object detection (``gOBJ`` in Robotiq's manual, section 4).
+
+        Contact is reported only by fingers that something has stopped short of the commanded opening and that press
+        on it; an object that is lost later ends in AT_POSITION, once the fingers have closed the gap.
+        """
+        short = self.opening_m - self._target
+        if abs(short) <= REACH_M:
+            return GripState.AT_POSITION
+        resistance = self._contact_force * np.sign(short)
+        if resistance < TOUCH_SHARE * self._force_n or self.speed > STOPPED_SPEED:
+            return GripState.MOVING
+        return GripState.CONTACT_CLOSING if short > 0 else GripState.CONTACT_OPENING
+
+    def go(self, opening_m: float, *, force_n: float, speed: float) -> None:
+        """Send the fingers to an opening. Raises MotionRefused outside the hand's ranges."""
+        checks = (
+            ("opening", opening_m, (0.0, gripper.STROKE_M), "m"),
+            ("force", force_n, gripper.FORCE_RANGE_N, "N"),
+            ("speed", speed, gripper.SPEED_RANGE_M_S, "m/s"),
+        )
+        for name, value, (low, high), unit in checks:
+            if not low <= value <= high:
+                raise MotionRefused(f"grip {name} {value} {unit} refused: the Hand-E's range is {low} to {high} {unit}")
+        self._model.actuator_forcerange[self._actuator] = [-force_n, force_n]
+        self._target, self._speed, self._set_point = opening_m, speed, self.opening_m
+
+    def advance(self, period_s: float) -> None:
+        """Move the set point on by one period, or push while the fingers cannot follow it."""
+        left = self._target - self._set_point
+        if left == 0.0 or self._stalled:
+            velocity, push = 0.0, np.sign(left) * self._force_n if self._stalled else 0.0
+        else:
+            step = np.sign(left) * min(abs(left), self._speed * period_s)
+            self._set_point = self._target if abs(left) <= abs(step) else self._set_point + step
+            velocity, push = step / period_s, 0.0
+        self._data.ctrl[self._inputs] = self._set_point, velocity, push
+
+    def stop(self) -> None:
+        """Halt moving fingers where they are; fingers that hold an object keep holding it."""
+        if self.state in (GripState.CONTACT_CLOSING, GripState.CONTACT_OPENING):
+            return
+        self._target = self._set_point = self.opening_m
+        self._data.ctrl[self._inputs] = self._target, 0.0, 0.0
+
+    @property
+    def _force_n(self) -> float:
+        return float(self._model.actuator_forcerange[self._actuator, 1])
+
+    @property
+    def _stalled(self) -> bool:
+        """Whether the fingers are behind their set point: something is in their way."""
+        behind = self.opening_m - self._set_point
+        return abs(behind) > REACH_M and behind * (self.opening_m - self._target) > 0.0
+
+    @property
+    def _contact_force(self) -> float:
+        """Force (N) with which contacts push the fingers open, both fingers' added; negative pushes them together."""
+        total, wrench = 0.0, np.zeros(6)
+        for i, contact in enumerate(self._data.contact):
+            for geom, direction in ((contact.geom1, -1.0), (contact.geom2, 1.0)):
+                finger = np.nonzero(self._bodies == self._model.geom_bodyid[geom])[0]
+                if len(finger):
+                    mujoco.mj_contactForce(self._model, self._data, i, wrench)
+                    force = direction * contact.frame.reshape(3, 3).T @ wrench[:3]
+                    axis = self._data.xmat[self._bodies[finger[0]]].reshape(3, 3)[:, 0] * self._signs[finger[0]]
+                    total += float(axis @ force)
+        return total
