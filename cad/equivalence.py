@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cad.spatial import Array, rotation_angle, rotation_from_rotvec, transform
 
@@ -54,6 +55,14 @@ class Symmetries:
         """(1 + S, 4, 4) the identity, then the discrete symmetries."""
         return np.concatenate([np.eye(4)[None], self.discrete])
 
+    def describe(self) -> str:
+        """For people: how many turns, and about which axes the part is round."""
+        if self._any_rotation:
+            return "a ball"
+        axes = [f"round about {(np.round(a.direction, 3) + 0.0).tolist()}" for a in self.continuous]
+        turns = len(self.discrete)
+        return ", ".join([*axes, f"{turns} turn{'' if turns == 1 else 's'}"] if turns or axes else ["none"])
+
     def with_axis(self, axis: Axis) -> Symmetries:
         """The same with one more continuous axis, unless there is one along it already."""
         if any(abs(abs(float(a.direction @ axis.direction)) - 1.0) < _PARALLEL for a in self.continuous):
@@ -94,7 +103,14 @@ class Symmetries:
         return min(options, key=lambda u: float(np.linalg.norm(u - reference)))
 
     def sampled(self, steps: int = 72) -> Array:
-        """(N, 4, 4) all symmetries, each continuous axis in ``steps`` turns (as BOP's toolkit discretises them)."""
+        """(N, 4, 4) all symmetries, each continuous axis in ``steps`` turns (as BOP's toolkit discretises them).
+
+        Of a ball, whose symmetries are all rotations, ``steps`` of them spread at random.
+        """
+        if self._any_rotation:
+            c = self.continuous[0].point
+            turns = Rotation.random(steps, rng=np.random.default_rng(0)).as_matrix()
+            return np.array([transform(R, c - R @ c) for R in turns])
         elements = list(self.elements)
         for axis in self.continuous:
             turns = [axis.turn(angle) for angle in 2 * np.pi * np.arange(1, steps) / steps]

@@ -1,6 +1,6 @@
 """A part and its folder: everything the other packages know about a part is read here.
 
-A folder holds ``part.json``, ``source.step``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces),
+A folder holds ``part.json``, ``source.*``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces),
 ``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``, ``keypoints.json``, ``grasps.json``
 and ``preview.png``. Built-in parts live in ``cad/library``; a user's own in the folder that ``parts_dir`` or the
 environment variable ``TAGCELL_PARTS_DIR`` names.
@@ -19,9 +19,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from cad.equivalence import Axis, Symmetries, axis_from_json, symmetries_from_json
 from cad.spatial import Array, rotation_z, transform
 
 LIBRARY = Path(__file__).parent / "library"
+BUILT_IN = ("inserted", "main", "top")
+"""Parts that come with Tagcell, in the order of their obj_id."""
 PARTS_DIR_VARIABLE = "TAGCELL_PARTS_DIR"
 
 
@@ -34,12 +37,26 @@ class PartError(CadError):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ViewEquivalent:
+    """A placement of the same part that looks the same from straight above.
+
+    It lies in ``stable_pose`` with its yaw larger by ``yaw`` rad and its footprint's centre shifted by ``shift_m``
+    (2,), given in the table frame of the original at yaw 0.
+    """
+
+    stable_pose: int
+    yaw: float
+    shift_m: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
 class StablePose:
     """One way a part comes to rest on a plane.
 
     ``R_table_part`` (3, 3) is the canonical orientation (yaw 0, table +z up), ``t_table_part`` (3,) the position of the
     part's origin when the centre of its bounding rectangle seen from above is at the table frame's origin, so that a
-    part at rest is ``T_board_part = planar(x, y, yaw) @ T_table_part``.
+    part at rest is ``T_board_part = planar(x, y, yaw) @ T_table_part``. A part whose hull is round about a level axis
+    rests at any turn about it: ``roll`` is that axis in the part's frame, and this one pose stands for all of them.
     """
 
     index: int
@@ -47,6 +64,8 @@ class StablePose:
     t_table_part: Array
     probability: float
     view_class: int
+    roll: Axis | None = None
+    view_equivalents: tuple[ViewEquivalent, ...] = ()
 
     @property
     def T_table_part(self) -> Array:
@@ -77,12 +96,17 @@ class Part:
     metallic: float
     roughness: float
     mesh: trimesh.Trimesh
-    symmetries: Array  # (S, 3, 3) proper rotations about the part's origin, identity first
+    symmetries: Symmetries
     stable_poses: tuple[StablePose, ...]
     keypoints: Array  # (K, 3), K = 8 by farthest-point sampling
     mesh_hash: str
     sources: tuple[str, ...] = ()
     info: dict[str, Any] = field(default_factory=dict)
+
+    def rest_symmetries(self, stable_pose: int) -> Symmetries:
+        """What leaves the part at rest in one of its stable poses: its symmetries and the roll of that pose."""
+        roll = self.stable_poses[stable_pose].roll
+        return self.symmetries if roll is None else self.symmetries.with_axis(roll)
 
     @cached_property
     def hulls(self) -> tuple[trimesh.Trimesh, ...]:
@@ -119,10 +143,19 @@ def hash_file(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
+def own_parts_dir(parts_dir: Path | None = None) -> Path:
+    """Where a user's own parts are: ``parts_dir``, else the environment variable, else the user's data directory."""
+    if parts_dir is not None:
+        return parts_dir
+    if named := os.environ.get(PARTS_DIR_VARIABLE):
+        return Path(named)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "tagcell" / "parts"
+
+
 def parts_roots(parts_dir: Path | None = None) -> list[Path]:
     """Folders searched for parts, the user's own first."""
-    own = parts_dir or (Path(os.environ[PARTS_DIR_VARIABLE]) if os.environ.get(PARTS_DIR_VARIABLE) else None)
-    return [own, LIBRARY] if own else [LIBRARY]
+    return [own_parts_dir(parts_dir), LIBRARY]
 
 
 def part_names(parts_dir: Path | None = None) -> list[str]:
@@ -130,7 +163,8 @@ def part_names(parts_dir: Path | None = None) -> list[str]:
     found: dict[str, int] = {}
     for root in parts_roots(parts_dir):
         for path in root.glob("*/part.json"):
-            found.setdefault(path.parent.name, int(json.loads(path.read_text())["obj_id"]))
+            if not path.parent.name.startswith("."):
+                found.setdefault(path.parent.name, int(json.loads(path.read_text())["obj_id"]))
     return sorted(found, key=found.__getitem__)
 
 
@@ -176,10 +210,8 @@ def _read_folder(folder: Path) -> Part:
     )
 
 
-def _read_symmetries(path: Path) -> Array:
-    discrete = json.loads(path.read_text()).get("symmetries_discrete", []) if path.exists() else []
-    rotations = [np.eye(3)] + [np.reshape(s, (4, 4))[:3, :3] for s in discrete]
-    return np.array(rotations)
+def _read_symmetries(path: Path) -> Symmetries:
+    return symmetries_from_json(json.loads(path.read_text())) if path.exists() else Symmetries()
 
 
 def _read_stable_poses(path: Path) -> tuple[StablePose, ...]:
@@ -192,6 +224,15 @@ def _read_stable_poses(path: Path) -> tuple[StablePose, ...]:
             t_table_part=np.array(p["t_table_part_m"]),
             probability=float(p["probability"]),
             view_class=int(p.get("view_class", i)),
+            roll=axis_from_json(p["roll"]) if p.get("roll") else None,
+            view_equivalents=tuple(
+                ViewEquivalent(
+                    stable_pose=int(e["stable_pose"]),
+                    yaw=float(e["yaw_rad"]),
+                    shift_m=(float(e["shift_m"][0]), float(e["shift_m"][1])),
+                )
+                for e in p.get("view_equivalents", ())
+            ),
         )
         for i, p in enumerate(json.loads(path.read_text())["stable_poses"])
     )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import planar
-from cad.spatial import Array, Intrinsics, apply, rotation_angle, wrap_angle
+from cad.spatial import Array, Intrinsics, apply, wrap_angle
 from perception.choice import FEATURES, ChoiceWeights, gate_evidence
 from perception.contour import ContourConfig, Refinement, refine_all
 from perception.faces import Face
@@ -237,6 +237,5 @@ def _same_pose(a: Candidate, b: Candidate) -> bool:
         return False
     pa = planar(a.refinement.x, a.refinement.y, a.refinement.yaw) @ a.face.stable_pose.T_table_part
     pb = planar(b.refinement.x, b.refinement.y, b.refinement.yaw) @ b.face.stable_pose.T_table_part
-    if np.linalg.norm(pa[:3, 3] - pb[:3, 3]) > 1e-4:
-        return False
-    return min(rotation_angle(pa[:3, :3], pb[:3, :3] @ S) for S in a.face.part.symmetries) < np.radians(2.0)
+    distance, angle = a.face.part.symmetries.difference(pa, pb)
+    return distance <= 1e-4 and angle < np.radians(2.0)

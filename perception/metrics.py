@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
-from cad.spatial import Array, apply
+from cad.equivalence import Symmetries
+from cad.spatial import Array, apply, rotation_angle
 
 COCO_THRESHOLDS = tuple(np.round(np.arange(0.5, 1.0, 0.05), 2).tolist())
 """Intersection-over-union thresholds that COCO and BOP average over."""
@@ -39,19 +39,21 @@ class PoseError:
         }
 
 
-def pose_error(T_cam_part_true: Array, T_cam_part: Array, symmetries: Array) -> PoseError:
-    """Error of a pose modulo ``symmetries`` (S, 3, 3), rotations about the part's origin, identity included."""
-    candidates = T_cam_part_true[:3, :3] @ symmetries  # (S, 3, 3)
-    angles = Rotation.from_matrix(np.swapaxes(candidates, 1, 2) @ T_cam_part[:3, :3]).magnitude()
-    e_x, e_y, e_z = np.abs(T_cam_part[:3, 3] - T_cam_part_true[:3, 3])
-    return PoseError(e_x_m=float(e_x), e_y_m=float(e_y), e_z_m=float(e_z), e_theta_rad=float(angles.min()))
+def pose_error(T_cam_part_true: Array, T_cam_part: Array, symmetries: Symmetries) -> PoseError:
+    """Error of a pose modulo the part's symmetries, of the equivalent pose that is turned least from the truth."""
+    nearest = symmetries.nearest(T_cam_part_true, T_cam_part)
+    e_x, e_y, e_z = np.abs(nearest[:3, 3] - T_cam_part_true[:3, 3])
+    angle = rotation_angle(T_cam_part_true[:3, :3], nearest[:3, :3])
+    return PoseError(e_x_m=float(e_x), e_y_m=float(e_y), e_z_m=float(e_z), e_theta_rad=angle)
 
 
-def mssd(T_cam_part_true: Array, T_cam_part: Array, vertices: ArrayLike, symmetries: Array) -> float:
+def mssd(T_cam_part_true: Array, T_cam_part: Array, vertices: ArrayLike, symmetries: Symmetries) -> float:
     """Maximum symmetry-aware surface distance in metres over vertices (V, 3) in frame ``part``."""
     vertices = np.asarray(vertices, np.float64)
     estimated = apply(T_cam_part, vertices)
-    distances = [np.linalg.norm(apply(T_cam_part_true, vertices @ S.T) - estimated, axis=1).max() for S in symmetries]
+    distances = [
+        np.linalg.norm(apply(T_cam_part_true @ S, vertices) - estimated, axis=1).max() for S in symmetries.sampled()
+    ]
     return float(min(distances))
 
 

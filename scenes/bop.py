@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cad.equivalence import symmetries_to_json
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics
 from scenes.errors import SceneError
@@ -107,9 +108,7 @@ def write_models(folder: Path, parts: Sequence[Part]) -> None:
         info: dict[str, Any] = {"diameter": part.diameter_m * 1e3}
         info |= {f"min_{axis}": float(low[i]) for i, axis in enumerate("xyz")}
         info |= {f"size_{axis}": float(size[i]) for i, axis in enumerate("xyz")}
-        discrete = [np.block([[R, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) for R in part.symmetries[1:]]
-        if discrete:
-            info["symmetries_discrete"] = [T.ravel().tolist() for T in discrete]
+        info |= {key: value for key, value in symmetries_to_json(part.symmetries).items() if value}
         infos[str(part.obj_id)] = info
     (models / "models_info.json").write_text(json.dumps(infos, indent=1))
 

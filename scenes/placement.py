@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import Part, load_part
+from cad.resting import nearest_rest
 from cad.spatial import Array, apply, inverse, rotation_from_quat_wxyz, transform
 from scenes.cell_config import CellConfig
 from scenes.errors import SceneError
@@ -126,9 +127,8 @@ def _misplaced(config: CellConfig, parts: Sequence[Part], T_board_part: Array, d
     centres = np.array([apply(T, p.mesh.bounds.mean(axis=0)) for T, p in zip(T_board_part, parts, strict=True)])
     wrong: NDArray[np.bool_] = np.any(np.abs(centres[:, :2]) > config.pick_area_half_m, axis=1)
     for i, part in enumerate(parts):
-        up = T_board_part[i, 2, :3]
-        poses = np.array([p.R_table_part[2] for p in part.stable_poses])
-        wrong[i] |= bool(len(poses)) and float((poses @ up).max()) < np.cos(drop.leaning_rad)
+        if part.stable_poses:
+            wrong[i] |= nearest_rest(part, T_board_part[i, :3, :3])[1] > drop.leaning_rad
         for j in range(i):
             apart = np.linalg.norm(centres[i, :2] - centres[j, :2]) - part.radius_m - parts[j].radius_m
             wrong[i] |= apart < drop.gap_m

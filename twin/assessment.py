@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from cad.equivalence import Symmetries
 from cad.parts import Part
+from cad.resting import nearest_rest
 from cad.spatial import Array, inverse, rotation_angle
 from perception.estimates import PartEstimate
 from twin.attempts import Attempt
-from twin.referee import PartRecord, nearest_stable_pose
+from twin.referee import PartRecord
 from twin.scorecard import PartResult, PoseError
 
 MATCH_M = 0.006
@@ -50,9 +52,9 @@ def match(
 
 def pose_error(part: Part, T_cam_part: Array, estimate: PartEstimate) -> PoseError:
     """Absolute errors in the camera frame; the angle modulo the part's proper symmetries."""
-    e = 1e3 * np.abs(estimate.T_cam_part[:3, 3] - T_cam_part[:3, 3])
-    R, R_estimated = T_cam_part[:3, :3], estimate.T_cam_part[:3, :3]
-    angle = min(rotation_angle(R @ s, R_estimated) for s in part.symmetries)
+    T_nearest = part.symmetries.nearest(T_cam_part, estimate.T_cam_part)
+    e = 1e3 * np.abs(T_nearest[:3, 3] - T_cam_part[:3, 3])
+    angle = rotation_angle(T_cam_part[:3, :3], T_nearest[:3, :3])
     class_right = estimate.part == part.name
     return PoseError(
         e_x_mm=float(e[0]),
@@ -64,11 +66,15 @@ def pose_error(part: Part, T_cam_part: Array, estimate: PartEstimate) -> PoseErr
     )
 
 
-def in_hand_error(part: Part, T_tcp_part: Array, T_part_tcp: Array) -> tuple[float, float, float, float]:
-    """(x mm, y mm, z mm, angle deg) of the part in the hand against where its grasp says it is, in the tcp frame."""
+def in_hand_error(alike: Symmetries, T_tcp_part: Array, T_part_tcp: Array) -> tuple[float, float, float, float]:
+    """(x mm, y mm, z mm, angle deg) of the part in the hand against where its grasp says it is, in the tcp frame.
+
+    ``alike`` are the transforms that its resting pose does not tell apart.
+    """
     T_believed = inverse(T_part_tcp)
-    x, y, z = 1e3 * (T_tcp_part[:3, 3] - T_believed[:3, 3])
-    angle = min(rotation_angle(T_believed[:3, :3] @ s, T_tcp_part[:3, :3]) for s in part.symmetries)
+    T_nearest = alike.nearest(T_believed, T_tcp_part)
+    x, y, z = 1e3 * (T_nearest[:3, 3] - T_believed[:3, 3])
+    angle = rotation_angle(T_believed[:3, :3], T_nearest[:3, :3])
     return float(x), float(y), float(z), float(np.degrees(angle))
 
 
@@ -78,7 +84,7 @@ def assess(scene: int, record: PartRecord, part: Part, beliefs: Beliefs) -> Part
     tried = [a for a in beliefs.attempts if a.T_part_tcp is not None]
     in_hand = None
     if record.T_tcp_part is not None and tried and tried[-1].T_part_tcp is not None and tried[-1].part == part.name:
-        in_hand = in_hand_error(part, record.T_tcp_part, tried[-1].T_part_tcp)
+        in_hand = in_hand_error(part.rest_symmetries(record.stable_pose), record.T_tcp_part, tried[-1].T_part_tcp)
     return PartResult(
         scene=scene,
         instance=record.instance,
@@ -141,11 +147,10 @@ def _wrong_estimate(record: PartRecord, part: Part, attempt: Attempt) -> str:
     """What was wrong with the discrete choice behind an attempt; empty when it was right."""
     if attempt.part != record.part:
         return f"taken for {attempt.part}"
-    believed, _ = nearest_stable_pose(part, attempt.T_base_part[:3, :3])
+    believed, _ = nearest_rest(part, attempt.T_base_part[:3, :3])
     if believed.index != record.stable_pose:
         return f"face {record.stable_pose} taken for face {believed.index}"
-    R, R_believed = record.T_world_presented[:3, :3], attempt.T_base_part[:3, :3]
-    angle = min(rotation_angle(R @ s, R_believed) for s in part.symmetries)
+    _, angle = part.rest_symmetries(believed.index).difference(record.T_world_presented, attempt.T_base_part)
     return f"{np.degrees(angle):.0f} degrees off" if angle > BRANCH_RAD and not record.moved_by_others else ""
 
 

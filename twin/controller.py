@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cad.parts import Part, planar
-from cad.spatial import Array, inverse, rotation_angle, yaw_of
+from cad.parts import Part
+from cad.resting import as_rest, settled
+from cad.spatial import Array, inverse, rotation_angle
 from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionError, PoseEstimator
 from twin.actions import ActionFailed, Actions
 from twin.attempts import (
@@ -124,12 +125,11 @@ class PickController:
     def _candidate(self, estimate: PartEstimate, T_base_cam: Array) -> Candidate:
         """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's."""
         part, T_base_board = self._parts[estimate.part], self._calibration.T_base_board
-        resting = part.stable_poses[estimate.stable_pose].T_table_part
-        T_board_part = inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part
-        yaw = yaw_of(T_board_part[:3, :3] @ resting[:3, :3].T)
-        x, y = T_board_part[:2, 3] - (planar(0.0, 0.0, yaw) @ resting)[:2, 3]
-        flat = planar(x, y, yaw) @ resting
+        pose = part.stable_poses[estimate.stable_pose]
+        T_board_part = as_rest(part, pose, inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part)
+        flat = settled(pose, T_board_part)
         tilt = rotation_angle(flat[:3, :3], T_board_part[:3, :3])
+        x, y = flat[:2, 3] - (flat[:3, :3] @ pose.R_table_part.T @ pose.t_table_part)[:2]
         off = T_board_part[2, 3] - flat[2, 3]
         problem: tuple[Outcome, str] | None = None
         if not estimate.accepted:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from cad.parts import Part
+from cad.resting import nearest_rest
 from cad.spatial import Array, apply, inverse, transform
 from perception.estimates import ACCEPTED, Frame, FrameEstimate, PartEstimate
 from scenes.camera import camera_pose
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, part_body
-from twin.referee import nearest_stable_pose
 
 LEANING_RAD = np.radians(5.0)
 """A part further than this from every stable pose leans on something and is declined."""
@@ -56,7 +56,7 @@ class OracleEstimator:
 
 
 def _true_estimate(part: Part, T_cam_part: Array, T_board_part: Array) -> PartEstimate:
-    pose, tilt = nearest_stable_pose(part, T_board_part[:3, :3])
+    pose, tilt = nearest_rest(part, T_board_part[:3, :3])
     leans = tilt > LEANING_RAD
     return PartEstimate(
         part=part.name,

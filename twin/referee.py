@@ -3,9 +3,9 @@
 It never asks the controller anything; the controller's only influence is to mark where one attempt ends and the next
 begins. Rules (names and numbers): a part is *picked* when both pads held it, lowest point at least 50 mm above the
 board, for 1 s of simulated time; *placed* when at rest in a nest of its class within 0.3 mm and 3 degrees (modulo its
-proper symmetries), same face down as it was presented; it *succeeded* when picked and placed, no other part moved by
-more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything but the part, the board under
-it and the nest.
+proper symmetries, and its roll where it is round), same face down as it was presented; it *succeeded* when picked and
+placed, no other part moved by more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything
+but the part, the board under it and the nest.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cad.parts import Part, StablePose
-from cad.spatial import Array, inverse, rotation_angle, transform
+from cad.equivalence import Symmetries
+from cad.parts import Part
+from cad.resting import nearest_rest
+from cad.spatial import Array, inverse, transform
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig
+from twin.robot_contacts import RobotContacts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,31 +69,6 @@ class PartRecord:
         return self.picked and self.placed and not self.disturbed and not self.collisions
 
 
-ROBOT, LEFT_PAD, RIGHT_PAD, BOARD, TRAY, OTHER = -1, -2, -3, -4, -5, -6
-_KIND_NAMES = {BOARD: "board", TRAY: "tray", OTHER: "table or stand"}
-
-
-def nearest_stable_pose(part: Part, R_table_part: Array) -> tuple[StablePose, float]:
-    """The stable pose whose downward direction is nearest to that of ``R_table_part``, and the angle between in rad."""
-
-    def tilt(pose: StablePose) -> float:
-        up = R_table_part[2]  # table's +z in the part frame
-        return min(
-            float(np.arctan2(np.linalg.norm(np.cross(up, u)), up @ u))
-            for u in (pose.R_table_part[2] @ s for s in part.symmetries)
-        )
-
-    best = min(part.stable_poses, key=tilt)
-    return best, tilt(best)
-
-
-def pose_difference(part: Part, T_target: Array, T_actual: Array) -> tuple[float, float]:
-    """Distance in m between the origins and angle in rad between the orientations, modulo the proper symmetries."""
-    distance = float(np.linalg.norm(T_actual[:3, 3] - T_target[:3, 3]))
-    angle = min(rotation_angle(T_target[:3, :3] @ s, T_actual[:3, :3]) for s in part.symmetries)
-    return distance, angle
-
-
 class Referee:
     """Watches one scene. Call ``watch`` after every physics step and ``begin_attempt`` before every attempt."""
 
@@ -107,9 +85,11 @@ class Referee:
         self._rules = rules or Rules()
         self._bodies = np.array([model.body(f"part_{i:02d}").id for i in range(len(parts))])
         self._tcp = model.site("tcp").id
-        self._kind = self._classify_geoms()
-        self._hull = [p.mesh.convex_hull.vertices for p in parts]
-        self._board_z = float(config.T_world_board[2, 3])
+        self._tcp_position = data.site_xpos[self._tcp]
+        self._contacts = RobotContacts(model, data, self._bodies)
+        self._hull = [np.array(p.mesh.convex_hull.vertices) for p in parts]
+        self._reach = [float(np.linalg.norm(hull, axis=1).max()) for hull in self._hull]
+        self._lifted_z = float(config.T_world_board[2, 3]) + self._rules.lift_m
         self._nests = {p.name: config.nest_frames(p.name) for p in parts}
         self.records = [self._present(i) for i in range(len(parts))]
         self._held_since = np.full(len(parts), np.nan)
@@ -132,32 +112,16 @@ class Referee:
 
     def watch(self) -> None:
         """Look at the contacts of the step just made."""
-        data = self._data
         if not self._open:
             return
-        tcp = data.site_xpos[self._tcp]
-        if tcp[2] < self._lowest[0]:
-            self._lowest = (float(tcp[2]), tcp.copy())
-        if not data.ncon:
-            return
-        kinds = self._kind[data.contact.geom]  # (ncon, 2)
-        robot = (kinds <= ROBOT) & (kinds >= RIGHT_PAD)
-        rows = np.nonzero(robot.any(axis=1))[0]
-        pads: dict[int, set[int]] = {}
-        for row in map(int, rows):
-            if robot[row].all():
-                continue
-            mine, other = (0, 1) if robot[row, 0] else (1, 0)
-            tool, thing = int(kinds[row, mine]), int(kinds[row, other])
-            if thing >= 0:
-                self._touched.add(thing)
-                if tool in (LEFT_PAD, RIGHT_PAD) and self._squeezes(row):
-                    pads.setdefault(thing, set()).add(tool)
-            else:
-                self._strike(thing, data.contact.pos[row])
-        for i, sides in pads.items():
-            if len(sides) == 2:
-                self._hold(i)
+        if self._tcp_position[2] < self._lowest[0]:
+            self._lowest = (float(self._tcp_position[2]), self._tcp_position.copy())
+        self._contacts.update()
+        self._touched |= self._contacts.touched
+        for thing, point in self._contacts.strikes:
+            self._strike(thing, point)
+        for i in self._contacts.held:
+            self._hold(i)
 
     def finish(self) -> list[PartRecord]:
         """Let the world come to rest, close the last attempt and judge where every part lies."""
@@ -166,7 +130,7 @@ class Referee:
         self._step(self._rules.rest_window_s)
         self._close_attempt()
         for i, record in enumerate(self.records):
-            distance, angle = pose_difference(self._parts[i], before[i], self._pose(i))
+            distance, angle = Symmetries().difference(before[i], self._pose(i))
             self._judge_place(i, record, distance <= self._rules.rest_m and angle <= self._rules.rest_rad)
         return self.records
 
@@ -177,19 +141,13 @@ class Referee:
 
     # -- during an attempt --------------------------------------------------------------------------------------
 
-    def _squeezes(self, row: int) -> bool:
-        """Whether a contact pushes along the closing direction, as the inner face of a pad does, and not sideways."""
-        closing = self._data.site_xmat[self._tcp].reshape(3, 3)[:, 0]
-        return abs(float(self._data.contact.frame[row, :3] @ closing)) > 0.9
-
     def _hold(self, i: int) -> None:
         if i not in self._gripped:
             self._gripped.append(i)
             self.records[i].gripped = True
-        now, body = self._data.time, self._bodies[i]
-        z = self._hull[i] @ self._data.xmat[body].reshape(3, 3)[2] + self._data.xpos[body][2]
-        if z.min() < self._board_z + self._rules.lift_m:
+        if not self._is_lifted(i):
             return
+        now = self._data.time
         if now - self._held_last[i] > self._rules.hold_gap_s or np.isnan(self._held_since[i]):
             self._held_since[i] = now
         self._held_last[i] = now
@@ -200,8 +158,15 @@ class Referee:
             T_world_tcp = transform(self._data.site_xmat[self._tcp].reshape(3, 3), self._data.site_xpos[self._tcp])
             record.T_tcp_part = inverse(T_world_tcp) @ self._pose(i)
 
-    def _strike(self, thing: int, point: Array) -> None:
-        name = _KIND_NAMES[thing]
+    def _is_lifted(self, i: int) -> bool:
+        """Whether the part's lowest point is high enough; where its origin settles that, the hull is not asked."""
+        body = self._bodies[i]
+        height = float(self._data.xpos[body, 2]) - self._lifted_z
+        if abs(height) > self._reach[i]:
+            return height > 0
+        return bool((self._hull[i] @ self._data.xmat[body, 6:]).min() + height >= 0)
+
+    def _strike(self, name: str, point: Array) -> None:
         if name not in self._struck:
             self._struck[name] = np.empty((0, 3))
         if len(self._struck[name]) < 64:
@@ -231,7 +196,7 @@ class Referee:
         record.collisions += self._forbidden(target)
 
     def _has_moved(self, part: Part, T_before: Array, T_after: Array) -> bool:
-        distance, angle = pose_difference(part, T_before, T_after)
+        distance, angle = part.symmetries.difference(T_before, T_after)
         return distance > self._rules.disturb_m or angle > self._rules.disturb_rad
 
     def _nearest(self, p_world: Array, poses: Array) -> int | None:
@@ -260,7 +225,8 @@ class Referee:
     def _judge_place(self, i: int, record: PartRecord, at_rest: bool) -> None:
         part, T = self._parts[i], self._pose(i)
         pose = part.stable_poses[record.stable_pose]
-        errors = [pose_difference(part, T_nest @ pose.T_table_part, T) for T_nest in self._nests[part.name]]
+        alike = part.rest_symmetries(pose.index)
+        errors = [alike.difference(T_nest @ pose.T_table_part, T) for T_nest in self._nests[part.name]]
         n = int(np.argmin([e[0] for e in errors]))
         near = errors[n][0] < 0.02
         record.nest = n if near else None
@@ -269,30 +235,9 @@ class Referee:
 
     def _present(self, i: int) -> PartRecord:
         T = self._pose(i)
-        pose, _ = nearest_stable_pose(self._parts[i], T[:3, :3])
+        pose, _ = nearest_rest(self._parts[i], T[:3, :3])
         return PartRecord(part=self._parts[i].name, instance=i, T_world_presented=T, stable_pose=pose.index)
 
     def _pose(self, i: int) -> Array:
         body = self._bodies[i]
         return transform(self._data.xmat[body].reshape(3, 3).copy(), self._data.xpos[body].copy())
-
-    def _classify_geoms(self) -> np.ndarray:
-        model = self._model
-        kind = np.full(model.ngeom, OTHER)
-        part_of_body = {int(b): i for i, b in enumerate(self._bodies)}
-        for g in range(model.ngeom):
-            name = model.geom(g).name
-            body = int(model.geom_bodyid[g])
-            if body in part_of_body:
-                kind[g] = part_of_body[body]
-            elif name == "pad_left":
-                kind[g] = LEFT_PAD
-            elif name == "pad_right":
-                kind[g] = RIGHT_PAD
-            elif model.body(body).name.startswith(("ur5e_", "hande_")):
-                kind[g] = ROBOT
-            elif name.startswith("board"):
-                kind[g] = BOARD
-            elif name.startswith("tray"):
-                kind[g] = TRAY
-        return kind

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from cad.equivalence import symmetries_to_json
 from cad.parts import Part
 from twin.scorecard import SceneResult
 
@@ -138,9 +139,7 @@ def print_part(part: Part, *, as_json: bool) -> None:
         count = sum(g["stable_pose"] == pose.index for g in part.grasps)
         table.add_row(str(pose.index), f"{pose.probability:.3f}", f"{1e3 * pose.height_m:.3f}", str(up), str(count))
     console.print(table)
-    console.print(
-        f"proper symmetries: {len(part.symmetries)} (the identity counted); mesh {part.mesh_hash}; {part.folder}"
-    )
+    console.print(f"proper symmetries: {part.symmetries.describe()}; mesh {part.mesh_hash}; {part.folder}")
     for source in part.sources:
         console.print(f"source: {source}")
 
@@ -153,7 +152,7 @@ def _describe(part: Part) -> dict[str, Any]:
         "mass_kg": part.mass_kg,
         "material": part.material,
         "mesh_hash": part.mesh_hash,
-        "symmetries": len(part.symmetries),
+        "symmetries": symmetries_to_json(part.symmetries),
         "stable_poses": [
             {"index": p.index, "probability": p.probability, "height_m": p.height_m} for p in part.stable_poses
         ],

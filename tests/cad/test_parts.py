@@ -83,7 +83,7 @@ def test_a_users_own_part_is_found_by_argument_or_environment(tmp_path, monkeypa
     part = load_part("brick", tmp_path)
     assert part.mass_kg == pytest.approx(144e-6)
     assert part.diameter_m == pytest.approx(np.sqrt(64 + 36 + 9) * 1e-3)
-    assert len(part.symmetries) == 4
+    assert len(part.symmetries.elements) == 4
     assert part.keypoints.shape == (8, 3)
     assert part.stable_poses == ()
     assert part.grasps == []

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from cad.equivalence import Symmetries
 from cad.parts import Part, StablePose, planar
 from cad.spatial import BASLER, Array, Intrinsics, apply, rotation_x, rotation_y, transform
 from perception.silhouette import render_view, solid_of
@@ -34,7 +35,7 @@ def make_part(mesh: trimesh.Trimesh, rotations: tuple[Array, ...] = (np.eye(3),)
         metallic=1.0,
         roughness=0.5,
         mesh=mesh,
-        symmetries=np.eye(3)[None],
+        symmetries=Symmetries(),
         stable_poses=tuple(poses),
         keypoints=np.asarray(mesh.bounding_box.vertices, dtype=np.float64),
         mesh_hash="",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from cad.equivalence import Symmetries
 from cad.parts import Part, StablePose, planar
 from cad.spatial import BASLER, Array, Intrinsics, inverse, rotation_from_rotvec, rotation_x, rotation_y, transform
 from perception.calibration import table_from_board
@@ -34,7 +35,7 @@ def part(obj_id: int) -> Part:
         metallic=1.0,
         roughness=0.5,
         mesh=trimesh.creation.box((4e-3, 6e-3, 2e-3)),
-        symmetries=np.eye(3)[None],
+        symmetries=Symmetries(),
         stable_poses=tuple(
             StablePose(index=i, R_table_part=R, t_table_part=np.array([0.0, 0.0, h]), probability=0.5, view_class=i)
             for i, (R, h) in enumerate(zip(rotations, heights, strict=True))

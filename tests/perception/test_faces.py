@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from cad.equivalence import Symmetries
 from cad.parts import Part, StablePose
 from cad.spatial import rotation_x, rotation_y, rotation_z, wrap_angle
 from perception.estimates import PerceptionError
@@ -27,7 +28,7 @@ def part_of(mesh: trimesh.Trimesh, rotations, name: str = "block", obj_id: int =
         metallic=0.0,
         roughness=1.0,
         mesh=mesh,
-        symmetries=np.eye(3)[None],
+        symmetries=Symmetries(),
         stable_poses=tuple(poses),
         keypoints=np.asarray(mesh.vertices[:8]),
         mesh_hash="",

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
+from cad.equivalence import Symmetries
 from cad.spatial import rotation_from_rotvec, rotation_x, rotation_z, transform
 from perception.metrics import DetectionScores, mask_iou, match_detections, mssd, pose_error, summary
 
-IDENTITY = np.eye(3)[None]
-TWO_FOLD = np.stack([np.eye(3), rotation_z(np.pi)])
+IDENTITY = Symmetries()
+TWO_FOLD = Symmetries(discrete=transform(rotation_z(np.pi))[None])
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
