@@ -16,8 +16,8 @@ from cad.spatial import Array, transform
 STROKE_M = 0.050
 """Largest opening between the pads."""
 FORCE_RANGE_N = (20.0, 130.0)
-"""Adjustable force of each finger: the manual's payload is ``2 F x friction / safety`` with F = 130 N at most (section 6,
-"Payload and force"); older data sheets state 185 N."""
+"""Adjustable force of each finger: the manual's payload is ``2 F x friction / safety`` with F = 130 N at most (section
+6, "Payload and force"); older data sheets state 185 N."""
 SPEED_RANGE_M_S = (0.020, 0.150)
 """Adjustable closing speed of the opening between the pads."""
 COUNTS = 255
