@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -41,12 +42,12 @@ class Trapezoid:
             if not (np.isfinite(value) and value > 0):
                 raise ProfileError(f"{name} {value} must be finite and positive")
 
-    @property
+    @cached_property
     def peak_speed(self) -> float:
         """Highest speed reached: the given one, or less on a path too short for it."""
         return float(min(self.speed, np.sqrt(self.length * self.acceleration)))
 
-    @property
+    @cached_property
     def duration_s(self) -> float:
         """Time from rest to rest."""
         if self.length == 0.0:
@@ -77,11 +78,17 @@ class JointPath:
     speed: float
     acceleration: float
 
-    @property
+    @cached_property
     def profile(self) -> Trapezoid:
         """Profile of the leading axis, the joint that moves furthest, in rad."""
         lead = float(np.abs(self.q_end - self.q_start).max(initial=0.0))
         return Trapezoid(length=lead, speed=self.speed, acceleration=self.acceleration)
+
+    @cached_property
+    def direction(self) -> Array:
+        """What each joint (n,) moves for a radian of the leading axis."""
+        way = self.q_end - self.q_start
+        return way / self.profile.length if self.profile.length else way
 
     @property
     def duration_s(self) -> float:
@@ -90,12 +97,8 @@ class JointPath:
 
     def at(self, time_s: float) -> tuple[Array, Array, Array]:
         """Joint positions, speeds and accelerations, each (n,), at ``time_s``."""
-        profile = self.profile
-        if profile.length == 0.0:
-            return self.q_end.copy(), np.zeros_like(self.q_end), np.zeros_like(self.q_end)
-        direction = (self.q_end - self.q_start) / profile.length
-        s, ds, dds = profile.at(time_s)
-        return self.q_start + direction * s, direction * ds, direction * dds
+        s, ds, dds = self.profile.at(time_s)
+        return self.q_start + self.direction * s, self.direction * ds, self.direction * dds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,12 +114,12 @@ class LinearPath:
     speed: float
     acceleration: float
 
-    @property
+    @cached_property
     def rotvec(self) -> Array:
         """Rotation from start to end as a rotation vector (3,) rad in the tool's starting frame."""
         return rotvec_from_rotation((inverse(self.T_base_start) @ self.T_base_end)[:3, :3])
 
-    @property
+    @cached_property
     def profile(self) -> Trapezoid:
         """Profile along the path, in metres."""
         line = float(np.linalg.norm(self.T_base_end[:3, 3] - self.T_base_start[:3, 3]))
@@ -169,3 +172,8 @@ def sample_times(duration_s: float, period_s: float) -> Iterator[float]:
     """Set-point times of a move: every control period after the start, the last one at or just after the end."""
     for k in range(1, max(1, int(np.ceil(duration_s / period_s - 1e-9))) + 1):
         yield k * period_s
+
+
+def sample(profile: Trapezoid, period_s: float) -> Array:
+    """Distance, speed and acceleration at the set-point times of a move, (3, n, 1) to be scaled along n rows."""
+    return np.array([profile.at(time_s) for time_s in sample_times(profile.duration_s, period_s)]).T[:, :, None]

@@ -116,7 +116,8 @@ class Referee:
             return
         if self._tcp_position[2] < self._lowest[0]:
             self._lowest = (float(self._tcp_position[2]), self._tcp_position.copy())
-        self._contacts.update()
+        if not self._contacts.update():
+            return
         self._touched |= self._contacts.touched
         for thing, point in self._contacts.strikes:
             self._strike(thing, point)
