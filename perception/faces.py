@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.parts import Part, StablePose, load_part, part_names
+from cad.parts import BUILT_IN, Part, StablePose, load_part
 from cad.spatial import Array, apply, rotation_angle, rotation_z, wrap_angle
 from perception.estimates import PerceptionError
 from perception.silhouette import rasterise, solid_of
@@ -74,8 +74,8 @@ class FaceTable:
 
     @classmethod
     def load(cls, names: Sequence[str] | None = None, parts_dir: Path | None = None) -> FaceTable:
-        """The faces of the parts called ``names``, of all parts by default."""
-        return cls([load_part(name, parts_dir) for name in (names or part_names(parts_dir))])
+        """The faces of the parts called ``names``, of the built-in ones by default."""
+        return cls([load_part(name, parts_dir) for name in (names or BUILT_IN)])
 
     def __len__(self) -> int:
         return len(self.faces)

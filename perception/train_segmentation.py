@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from cad.parts import load_part, part_names
+from cad.parts import BUILT_IN, load_part
 from cad.spatial import Array
 from perception.dataset import load_windows, manifest_hash
 from perception.metrics import DetectionScores, mask_iou, summary
@@ -214,7 +214,7 @@ def figures_of(examined: Sequence[Examined], min_score: float = 0.0) -> dict[str
 def train_segmentation(config: SegmentationTraining) -> None:
     """Train, pick the score threshold on the validation windows, and keep the weights with their figures."""
     cv2.setNumThreads(config.threads)
-    names = part_names()
+    names = BUILT_IN
     parts = [load_part(name) for name in names]
     training, validation = (Windows(load_windows(path), parts) for path in (config.data, config.val))
     device = default_device()

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from cad.gripper import FORCE_RANGE_N
+from cad.parts import Part
 from cad.robot import UR5E, DhTable
 from cad.spatial import BASLER, Array, Intrinsics, inverse, rotation_x, rotation_z, transform
 from cad.station import BOOM_REACH_M, TRAY_SIZE_M
 from cad.tagboard import TagboardConfig
 from scenes.errors import SceneError
+
+HAND_CLEARANCE_M = 0.012
+"""Between the parts in two nests: room for an open finger on either side of each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +42,23 @@ class TrayConfig:
                 f"{len(self.classes)} classes with {self.nests_per_class} nests need {need[0]:.3f} x {need[1]:.3f} m; "
                 f"the tray has {TRAY_SIZE_M[0]} x {TRAY_SIZE_M[1]} m: use fewer nests_per_class or a smaller pitch_m"
             )
+
+    @classmethod
+    def for_parts(cls, parts: Sequence[Part], at_least: int = 1) -> TrayConfig:
+        """A tray with as many nests for ``parts`` as their size leaves room for, up to the usual number.
+
+        Raises SceneError when there is no room for ``at_least`` nests a class.
+        """
+        plain = cls()
+        need = max(2 * part.radius_m for part in parts) + HAND_CLEARANCE_M
+        nests = min(plain.nests_per_class, int(TRAY_SIZE_M[1] / need))
+        if nests < at_least or len(parts) * need > TRAY_SIZE_M[0]:
+            raise SceneError(
+                f"the tray of {1e3 * TRAY_SIZE_M[0]:.0f} x {1e3 * TRAY_SIZE_M[1]:.0f} mm has no room for {at_least} "
+                f"nests of {1e3 * need:.0f} mm for each of {len(parts)} parts; use fewer or smaller parts"
+            )
+        pitch = max(need, min(plain.pitch_m[0], TRAY_SIZE_M[0] / len(parts))), max(need, plain.pitch_m[1])
+        return cls(classes=tuple(part.name for part in parts), nests_per_class=nests, pitch_m=pitch)
 
     def nests(self, part: str) -> Array:
         """``T_tray_nest`` (K, 4, 4) of a class; raises SceneError for a class the tray has no nests for."""

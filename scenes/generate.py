@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from cad.parts import load_part, part_names
+from cad.parts import BUILT_IN, load_part
 from cad.spatial import Intrinsics, inverse
 from scenes.bop import Annotation, ChunkWriter, annotation_box, write_models
 from scenes.distractors import distractor_meshes
@@ -80,8 +80,8 @@ class DatasetConfig:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parts shown: those asked for, or all there are."""
-        return self.parts or tuple(part_names(self.parts_dir))
+        """Names of the parts shown: those asked for, or the built-in ones."""
+        return self.parts or BUILT_IN
 
 
 def generate(config: DatasetConfig, out: Path, report: Callable[[str], None] = print) -> None:

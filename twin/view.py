@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cad.parts import part_names
+from cad.parts import BUILT_IN
 from cad.robot import JOINT_NAMES
 from cad.spatial import Array, rotation_x, transform
 from scenes.gl import mujoco
@@ -24,7 +24,7 @@ ROOM = "room_"
 def save_views(out: Path, *, seed: int, parts_per_class: int = 2) -> list[Path]:
     """Drop parts from ``seed``, hold the hand above the board and save cell.jpg, camera.jpg in ``out``."""
     cell = CellConfig()
-    instances = [name for name in part_names() for _ in range(parts_per_class)]
+    instances = [name for name in BUILT_IN for _ in range(parts_per_class)]
     T_world_part = settle_parts(cell, instances, np.random.default_rng(seed))
     spec = build_workcell(cell, instances)
     _light_the_room(spec)
