@@ -1,65 +1,83 @@
 """Rotational symmetries of a part, found from its mesh and written in BOP's ``models_info`` form.
 
-Only proper rotations count: a mirror plane cannot be reached by turning the part. A rotation about the centroid is a
-symmetry when it moves no point of the surface farther than the tolerance from the surface. Candidates come from two
-places that complement each other: simple turns about the principal axes of inertia (right for any tessellation) and
-maps between pairs of hull vertices (right for solids with equal moments, such as a cube).
+Only proper rotations count: a mirror plane cannot be reached by turning the part. Every symmetry turns about an axis
+through the centroid, and the moments of the volume leave few directions for one (``cad.moments``). Along each the
+largest order is found, from which the group is generated, drawn to an exact group, and tested: an element counts when
+it moves no point of the surface farther than the tolerance from the surface. As the inverse of each element is an
+element, that is the Hausdorff distance both ways.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 
 from cad.equivalence import Axis, Symmetries, symmetries_to_json
-from cad.meshes import distance_to_surface, surface_samples
-from cad.spatial import Array, rotation_from_rotvec, transform
+from cad.meshes import surface_samples
+from cad.moments import axis_directions
+from cad.nearest import Surface
+from cad.spatial import Array, rotation_from_rotvec, rotvec_from_rotation, transform
 
-RELATIVE_TOLERANCE = 0.01
-"""A symmetry may move the surface by this share of the part's diameter."""
-SAME_ROTATION_RAD = np.radians(5.0)
-TURNS = (2, 3, 4, 5, 6, 8)
+RELATIVE_TOLERANCE = 0.003
+TOLERANCE_BOUNDS_M = (5e-6, 30e-6)
+"""The default tolerance is the relative one times the diameter, within these bounds.
+
+A tenth of a millimetre that breaks a symmetry must be seen, and as the centroid moves along, a side that is longer by
+0.1 mm moves the surface by 0.05 mm only: hence 30 um. CAD surfaces are meshed to 2 um, and a turn of such a cylinder
+moves its surface by as much: hence 5 um.
+"""
+MAX_ORDER = 60
+_PRIMES = tuple(p for p in range(2, MAX_ORDER) if all(p % k for k in range(2, p)))
 _ODD_ANGLES_RAD = (0.41, 1.0, 1.73, 2.6)  # shared by no finite turn: what passes them is continuous
-_GOOD = 0.25  # a rotation found this well, relative to the tolerance, is not looked for again
-_SAMPLES = 600
-_DENSE = 20_000
-_DOUBTFUL = 20  # points whose distance from the dense samples is largest, measured exactly
-_MAX_PAIRS = 4000
+_SAME_RAD = np.radians(2.0)
+_STEP_RAD = np.radians(0.5)
+_POLYHEDRAL = 5  # turns of a higher order have one axis
+_QUICK, _SOME, _SAMPLES, _MOST_CORNERS = 96, 500, 4000, 20_000
+_REFINEMENTS = 4
+_KEPT = 0.8  # of the points: the others are near edges, where the face found may be the wrong one
+_WEAK = 1e-6
+_LARGEST_GROUP = 2 * MAX_ORDER
 
 
 def find_symmetries(mesh: trimesh.Trimesh, tolerance_m: float | None = None) -> Symmetries:
-    """All proper rotational symmetries of a closed mesh within ``tolerance_m`` (default 1 % of its diameter)."""
-    checker = _Checker(mesh, tolerance_m)
-    axes = [axis for axis in checker.principal_axes if checker.is_continuous(axis)]
-    found: list[tuple[float, Array]] = []
-    for R in checker.candidates():
-        if _covered(R, axes):
-            continue
-        if any(d < _GOOD * checker.tolerance_m and _same(R, other, axes) for d, other in found):
-            continue
-        if not checker.may_pass(R):
-            continue
-        deviation = checker.deviation(R)
-        if deviation <= checker.tolerance_m:
-            found.append((deviation, R))
-    kept: list[Array] = []
-    for _, R in sorted(found, key=lambda item: item[0]):
-        if not any(_same(R, other, axes) for other in kept):
-            kept.append(R)
-    c = checker.centre
+    """All proper rotational symmetries of a closed mesh in metres within ``tolerance_m``.
+
+    The default is ``default_tolerance_m``. Turns of up to 60 a circle are told from round; a ball has two axes, which
+    generate every rotation. Raises ValueError for a tolerance that is not positive.
+    """
+    tolerance_m = default_tolerance_m(diameter(mesh)) if tolerance_m is None else float(tolerance_m)
+    if not tolerance_m > 0:
+        raise ValueError(f"tolerance {tolerance_m} m: it must be positive")
+    solid = _Solid(mesh, tolerance_m)
+    directions = axis_directions(mesh, solid.centre)
+    round_axes = solid.round_axes(directions)
+    rotations = solid.flip(round_axes[0], None) if len(round_axes) == 1 else []
+    if not round_axes:
+        rotations = solid.group(directions)
+    c = solid.centre
     return Symmetries(
-        discrete=np.array([transform(R, c - R @ c) for R in kept]).reshape(-1, 4, 4),
-        continuous=tuple(Axis(direction=axis, point=c) for axis in axes),
-        tolerance_m=checker.tolerance_m,
+        discrete=np.array([transform(R, c - R @ c) for R in rotations]).reshape(-1, 4, 4),
+        continuous=tuple(Axis(direction=axis, point=c) for axis in round_axes),
+        tolerance_m=tolerance_m,
     )
 
 
+def deviation_m(mesh: trimesh.Trimesh, symmetries: Symmetries, steps: int = 12) -> float:
+    """Largest distance in metres that a symmetry moves the surface by, continuous axes taken in ``steps`` turns."""
+    solid = _Solid(mesh, symmetries.tolerance_m)
+    turns = [axis.turn(angle) for axis in symmetries.continuous for angle in 2 * np.pi * np.arange(1, steps) / steps]
+    return max((solid.deviation(T[:3, :3]) for T in [*symmetries.discrete, *turns]), default=0.0)
+
+
+def default_tolerance_m(diameter_m: float) -> float:
+    """0.3 % of the diameter, at least 5 um and at most 30 um."""
+    return float(np.clip(RELATIVE_TOLERANCE * diameter_m, *TOLERANCE_BOUNDS_M))
+
+
 def models_info(mesh: trimesh.Trimesh, symmetries: Symmetries) -> dict[str, Any]:
-    """The part's entry of a BOP ``models_info.json``: millimetres, transforms as 16 numbers row by row."""
+    """The part's entry of a BOP ``models_info.json`` in millimetres; ``symmetry_tolerance`` is ours."""
     low, high = 1e3 * mesh.bounds
     info: dict[str, Any] = {"diameter": round(1e3 * diameter(mesh), 6)}
     info |= {f"min_{a}": round(float(v), 6) for a, v in zip("xyz", low, strict=True)}
@@ -71,92 +89,157 @@ def models_info(mesh: trimesh.Trimesh, symmetries: Symmetries) -> dict[str, Any]
 
 def diameter(mesh: trimesh.Trimesh) -> float:
     """Largest distance in metres between two points of the mesh."""
-    v = mesh.convex_hull.vertices
+    v = np.asarray(mesh.convex_hull.vertices)
     return float(max(np.linalg.norm(v - p, axis=1).max() for p in v))
 
 
-class _Checker:
-    """One mesh about its centroid, prepared for testing many rotations."""
+class _Solid:
+    """A mesh about its centroid, prepared for testing many rotations."""
 
-    def __init__(self, mesh: trimesh.Trimesh, tolerance_m: float | None) -> None:
-        self.tolerance_m = RELATIVE_TOLERANCE * diameter(mesh) if tolerance_m is None else float(tolerance_m)
-        if not self.tolerance_m > 0:
-            raise ValueError(f"tolerance {self.tolerance_m} m: it must be positive")
+    def __init__(self, mesh: trimesh.Trimesh, tolerance_m: float) -> None:
+        self.tolerance_m = tolerance_m
         self.centre = np.array(mesh.center_mass)
-        self.mesh = trimesh.Trimesh(mesh.vertices - self.centre, mesh.faces, process=False)
-        self.corners = np.array(self.mesh.convex_hull.vertices)
+        centred = trimesh.Trimesh(mesh.vertices - self.centre, mesh.faces, process=False)
         rng = np.random.default_rng(0)
-        self.samples = np.concatenate([surface_samples(self.mesh, _SAMPLES, rng)[0], self.mesh.vertices[:_SAMPLES]])
-        dense = np.concatenate([surface_samples(self.mesh, _DENSE, rng)[0], self.mesh.vertices])
-        self._tree = cKDTree(dense)
-        self._spacing = 4 * np.sqrt(self.mesh.area / _DENSE)
-        moments, axes = np.linalg.eigh(self.mesh.moment_inertia)
-        self.moments, self.principal_axes = moments, [_signed(axis) for axis in axes.T]
+        corners = np.asarray(centred.vertices)
+        if len(corners) > _MOST_CORNERS:
+            corners = rng.choice(corners, _MOST_CORNERS, replace=False)
+        self.points = np.concatenate([surface_samples(centred, _SAMPLES, rng)[0], corners])
+        self.few, self.some = rng.choice(self.points, _QUICK), rng.choice(self.points, _SOME)
+        self.surface = Surface(centred)
+        self.slack_m = 2 * float(np.sin(_STEP_RAD) * np.linalg.norm(corners, axis=1).max())
+
+    def may_pass(self, R: Array, slack_m: float = 0.0) -> bool:
+        """Cheap test that rejects most rotations that are no symmetry and hardly ever one that is."""
+        return not self.surface.surely_beyond(self.few @ R.T, self.tolerance_m + slack_m)
 
     def deviation(self, R: Array) -> float:
-        """Largest distance in metres from the surface of the sample points turned by ``R``."""
-        turned = self.samples @ R.T
-        near = self._tree.query(turned)[0]
-        doubtful = turned[np.argsort(-near)[:_DOUBTFUL]]
-        return float(distance_to_surface(self.mesh, doubtful).max())
+        """Largest distance in metres from the surface of the points turned by ``R``."""
+        return self.surface.largest(self.points @ R.T)
 
-    def may_pass(self, R: Array) -> bool:
-        """Cheap test that rejects most rotations that are no symmetry and never one that is."""
-        near = self._tree.query(self.samples[::8] @ R.T)[0]
-        return bool(near.max() <= self.tolerance_m + self._spacing)
+    def passes(self, R: Array) -> bool:
+        """Whether the rotation is a symmetry."""
+        return self.may_pass(R) and self.surface.all_within(self.points @ R.T, self.tolerance_m)
 
-    def is_continuous(self, axis: Array) -> bool:
-        """True when turning about ``axis`` by angles that no finite turn shares leaves the surface in place."""
-        turns = [rotation_from_rotvec(angle * axis) for angle in _ODD_ANGLES_RAD]
-        return all(self.may_pass(R) and self.deviation(R) <= self.tolerance_m for R in turns)
+    def refined(self, R: Array) -> Array:
+        """The rotation next to ``R`` that lays the solid on itself best: distances along normals, least squares."""
+        for _ in range(_REFINEMENTS):
+            turned = self.some @ R.T
+            found, normals = self.surface.nearest(turned)
+            distances = np.einsum("ni,ni->n", normals, found - turned)
+            kept = np.argsort(np.linalg.norm(found - turned, axis=1))[: round(_KEPT * len(turned))]
+            step = np.linalg.lstsq(np.cross(turned, normals)[kept], distances[kept], rcond=_WEAK)[0]
+            R = rotation_from_rotvec(step) @ R
+        return R
 
-    def candidates(self) -> Iterator[Array]:
-        for axis in self.principal_axes:
-            for n in TURNS:
-                for k in range(1, n):
-                    yield rotation_from_rotvec(2 * np.pi * k / n * axis)
-        yield from self._vertex_maps()
+    def round_axes(self, directions: Array) -> list[Array]:
+        """The axis about which every turn leaves the surface in place; two of them when every rotation does."""
+        for direction in directions:
+            if not all(self.may_pass(_turn(direction, angle), self.slack_m) for angle in _ODD_ANGLES_RAD):
+                continue
+            axis = _axis(self.refined(_turn(direction, _ODD_ANGLES_RAD[-1])))
+            if self._is_round(axis):
+                other = _across(axis)
+                return [axis, other] if self._is_round(other) else [axis]
+        return []
 
-    def _vertex_maps(self) -> Iterator[Array]:
-        """Rotations that map a rare hull vertex and a second one to vertices as far out and as far apart."""
-        v, tol = self.corners, self.tolerance_m
-        radius = np.linalg.norm(v, axis=1)
-        far = np.flatnonzero(radius > 0.5 * radius.max())
-        same_radius = np.abs(radius[far, None] - radius[None]) <= tol
-        a = far[np.argmin(same_radius.sum(axis=1))]
-        apart = np.linalg.norm(v - v[a], axis=1)
-        spread = np.linalg.norm(np.cross(v[a], v), axis=1) / radius[a]
-        b = int(np.argmax(spread))
-        count = 0
-        for i in np.flatnonzero(np.abs(radius - radius[a]) <= tol):
-            partners = np.abs(radius - radius[b]) <= tol
-            partners &= np.abs(np.linalg.norm(v - v[i], axis=1) - apart[b]) <= 2 * tol
-            for j in np.flatnonzero(partners):
-                count += 1
-                if count > _MAX_PAIRS:
-                    return
-                yield _frame(v[i], v[j]) @ _frame(v[a], v[b]).T
+    def _is_round(self, axis: Array) -> bool:
+        return all(self.passes(_turn(axis, sign * angle)) for angle in _ODD_ANGLES_RAD for sign in (1, -1))
+
+    def flip(self, axis: Array, order: int | None) -> list[Array]:
+        """A half-turn about an axis across ``axis`` if there is one; ``order`` is None when the solid is round."""
+        count = max(1, round(np.pi / order / _STEP_RAD)) if order else 1
+        x = _across(axis)
+        y = np.cross(axis, x)
+        best, least = None, np.inf
+        for angle in np.pi / (order or 1) * np.arange(count) / count:
+            R = _turn(np.cos(angle) * x + np.sin(angle) * y, np.pi)
+            if self.may_pass(R, self.slack_m):
+                mean = float(self.surface.upper_bounds(self.few @ R.T).mean())
+                best, least = (R, mean) if mean < least else (best, least)
+        if best is None:
+            return []
+        R = _turn(_axis(self.refined(best)), np.pi)
+        return [R] if self.passes(R) else []
+
+    def order(self, direction: Array) -> tuple[int, Array]:
+        """The largest order of a turn about an axis near ``direction`` that is a symmetry, 1 when none is; the axis."""
+        fails = [p for p in _PRIMES if not self.may_pass(_turn(direction, 2 * np.pi / p), self.slack_m)]
+        if len(fails) == len(_PRIMES):
+            return 1, direction
+        for n in range(MAX_ORDER, 1, -1):
+            angle = 2 * np.pi / n
+            if any(n % p == 0 for p in fails) or not self.may_pass(_turn(direction, angle), self.slack_m):
+                continue
+            axis = _axis(self.refined(_turn(direction, angle)))
+            if self.passes(_turn(axis, angle)):
+                return n, axis
+        return 1, direction
+
+    def group(self, directions: Array) -> list[Array]:
+        """Rotations but the identity that, with it, form a finite group of symmetries."""
+        turns: list[tuple[int, Array]] = []
+        for direction in directions:
+            n, axis = self.order(direction)
+            if n > _POLYHEDRAL:
+                turns = [(n, axis)]
+                break
+            turns += [(n, axis)] if n > 1 else []
+        turns.sort(key=lambda item: -item[0])
+        generators = [_turn(axis, 2 * np.pi / n) for n, axis in turns]
+        if turns:
+            generators += self.flip(turns[0][1], turns[0][0])
+        group = np.eye(3)[None]
+        for generator in generators:
+            if not _is_among(generator, group):
+                larger = _closure(group, generator)
+                if all(self.passes(R) for R in larger[1:]):
+                    group = larger
+        return list(group[1:])
 
 
-def _frame(p: Array, q: Array) -> Array:
-    x = p / np.linalg.norm(p)
-    z = np.cross(p, q)
-    z = z / np.linalg.norm(z)
-    return np.column_stack([x, np.cross(z, x), z])
+def _closure(group: Array, generator: Array) -> Array:
+    """The group (N, 3, 3), made exact, that ``generator`` (3, 3) and a group generate; that group if it is too large."""
+    generators, larger = [*group[1:], generator], group
+    queue = [generator]
+    while queue:
+        a = queue.pop()
+        if _is_among(a, larger):
+            continue
+        larger = np.concatenate([larger, a[None]])
+        if len(larger) > _LARGEST_GROUP:
+            return group
+        queue += [a @ b for b in generators]
+    return _exact(larger)
 
 
-def _signed(axis: Array) -> Array:
-    """The axis or its opposite, whichever has its largest component positive."""
-    return axis * np.sign(axis[np.argmax(np.abs(axis))])
+def _exact(group: Array) -> Array:
+    """The exact group next to rotations (N, 3, 3) that form one nearly: each becomes the mean of all its products."""
+    flat = group.reshape(len(group), 9)
+    products = np.einsum("iab,jcb->ijac", group, group).reshape(-1, 9)  # R_i R_j^-1
+    table = np.argmax(products @ flat.T, axis=1).reshape(len(group), len(group))
+    for _ in range(_REFINEMENTS):
+        means = np.einsum("ijab,jbc->iac", group[table], group)
+        u, _, vt = np.linalg.svd(means)
+        group = u @ vt
+    return group
 
 
-def _covered(R: Array, axes: list[Array]) -> bool:
-    """True for the identity and for turns about a continuous axis."""
-    return _same(R, np.eye(3), axes)
+def _is_among(R: Array, group: Array) -> bool:
+    """Whether a rotation (3, 3) is nearly one of ``group`` (N, 3, 3)."""
+    return bool((np.einsum("nab,ab->n", group, R) > 1 + 2 * np.cos(_SAME_RAD)).any())
 
 
-def _same(a: Array, b: Array, axes: list[Array]) -> bool:
-    """True when two rotations are alike, or differ by a turn about a continuous axis only."""
-    if np.trace(a.T @ b) > 1 + 2 * np.cos(SAME_ROTATION_RAD):
-        return True
-    return any(float((a @ axis) @ (b @ axis)) > np.cos(SAME_ROTATION_RAD) for axis in axes)
+def _turn(axis: Array, angle: float) -> Array:
+    return rotation_from_rotvec(angle * axis)
+
+
+def _axis(R: Array) -> Array:
+    rotvec = rotvec_from_rotation(R)
+    return rotvec / np.linalg.norm(rotvec)
+
+
+def _across(axis: Array) -> Array:
+    """A unit vector (3,) across ``axis``."""
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    return across / np.linalg.norm(across)
