@@ -18,7 +18,7 @@ from cad.symmetry import find_symmetries, models_info
 
 @dataclass(frozen=True, kw_only=True)
 class PartFacts:
-    """What a mesh does not tell about a part."""
+    """What a mesh does not tell about a part; ``notes`` say what was mended of its source."""
 
     name: str
     obj_id: int
@@ -28,6 +28,8 @@ class PartFacts:
     metallic: float
     roughness: float
     sources: tuple[str, ...] = ()
+    source_unit: str = "mm"
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():

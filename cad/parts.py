@@ -175,13 +175,21 @@ def load_part(name: str, parts_dir: Path | None = None) -> Part:
     """
     for root in parts_roots(parts_dir):
         if (root / name / "part.json").exists():
-            return _read_folder((root / name).resolve())
+            folder = (root / name).resolve()
+            return _read_folder(folder, _stamp(folder))
     known = ", ".join(part_names(parts_dir)) or "none"
     raise PartError(f"no part is called {name!r}; parts there are: {known}")
 
 
+def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    """Changes whenever a file of the folder does, so that what was read before is not taken for what is there now."""
+    files = sorted((entry for entry in os.scandir(folder) if entry.is_file()), key=lambda entry: entry.name)
+    return tuple((entry.name, entry.stat().st_mtime_ns, entry.stat().st_size) for entry in files)
+
+
 @lru_cache(maxsize=64)
-def _read_folder(folder: Path) -> Part:
+def _read_folder(folder: Path, stamp: tuple[tuple[str, int, int], ...]) -> Part:
+    del stamp
     info = json.loads((folder / "part.json").read_text())
     mesh_path = folder / "mesh.ply"
     if not mesh_path.exists():

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from cad.parts import CadError, load_part, part_names
+from cad.parts import CadError
 from perception.estimates import PerceptionError
 from scenes.errors import SceneError
+from twin.part_cli import Part
 from twin.pick_config import PickConfig
 from twin.robot import TwinError
 
@@ -98,49 +99,6 @@ class Train:
         written = train_all(data=self.data, out=self.out, minutes=self.minutes, seed=self.seed, threads=self.threads)
         if self.json:
             print(json.dumps([str(p) for p in written]))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PartList:
-    """The parts there are."""
-
-    json: bool = False
-    """Print as JSON."""
-
-    def run(self) -> None:
-        """Print one line a part."""
-        from twin.report import print_parts
-
-        print_parts([load_part(name) for name in part_names()], as_json=self.json)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PartShow:
-    """One part: size, mass, symmetries, stable poses and grasps."""
-
-    name: Positional[str]
-    """Name of the part."""
-    json: bool = False
-    """Print as JSON."""
-
-    def run(self) -> None:
-        """Print the part."""
-        from twin.report import print_part
-
-        print_part(load_part(self.name), as_json=self.json)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Part:
-    """Parts: list them, show one."""
-
-    action: OmitSubcommandPrefixes[
-        Annotated[PartList, subcommand("list")] | Annotated[PartShow, subcommand("show", prefix_name=False)]
-    ]
-
-    def run(self) -> None:
-        """Run the chosen action."""
-        self.action.run()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

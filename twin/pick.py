@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from cad.parts import Part, hash_file, load_part
+from cad.robot import UR5E
+from cad.robot_calibration import read_dh_calibration
 from perception.estimates import PoseEstimator
+from scenes.cell_config import CellConfig, TrayConfig
 from twin.doctor import versions
 from twin.pick_config import PickConfig
 from twin.report import ScenesProgress
@@ -24,6 +27,8 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
     Raises TwinError when ``out`` cannot be written and PerceptionError when weights are missing, before any scene runs.
     """
     _check_writable(config.out)
+    parts = {name: load_part(name, config.parts_dir) for name in config.parts}
+    cell_for(config)
     weights = check_weights(config)
     results: list[SceneResult] = []
     with ScenesProgress(config.scenes, quiet=quiet) as progress:
@@ -34,11 +39,11 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
     card = build_scorecard(
         results,
         config=config_json(config),
-        views_differ=all(_views_differ(load_part(name)) for name in config.parts),
+        views_differ=all(_views_differ(part) for part in parts.values()),
         seed=config.seed,
         versions=versions(),
         weights=weights,
-        meshes={name: load_part(name).mesh_hash for name in config.parts},
+        meshes={name: part.mesh_hash for name, part in parts.items()},
     )
     write_json(config.out / "scorecard.json", card)
     return card
@@ -46,18 +51,32 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
 
 def run_scene(config: PickConfig, scene: int) -> SceneResult:
     """One scene, from (seed, scene) alone."""
-    from scenes.workcell import CellConfig
     from twin.scene_trial import SceneTrial
 
-    return SceneTrial(config, scene, _estimator(config), CellConfig()).run()
+    return SceneTrial(config, scene, _estimator(config), cell_for(config)).run()
+
+
+def cell_for(config: PickConfig) -> CellConfig:
+    """The cell of a run: nests for its parts, and the arm it is about.
+
+    Raises SceneError when the tray has no room for the parts and CalibrationFileError for a calibration that cannot be
+    used.
+    """
+    parts = [load_part(name, config.parts_dir) for name in config.parts]
+    return CellConfig(
+        tray=TrayConfig.for_parts(parts, at_least=config.parts_per_class),
+        arm=read_dh_calibration(config.arm_calibration) if config.arm_calibration else UR5E,
+        parts_dir=config.parts_dir,
+    )
 
 
 def config_json(config: PickConfig) -> dict[str, Any]:
     """The configuration without what cannot change the result."""
     values = dataclasses.asdict(config)
-    for name in ("out", "jobs", "pictures"):
+    for name in ("out", "jobs", "pictures", "parts_dir"):
         del values[name]
-    return values | {"weights": str(config.weights) if config.weights else None, "parts": list(config.parts)}
+    paths = {name: str(values[name]) if values[name] else None for name in ("arm_calibration", "weights")}
+    return values | paths | {"parts": list(config.parts)}
 
 
 def check_weights(config: PickConfig) -> dict[str, str]:
@@ -84,7 +103,7 @@ def _estimator(config: PickConfig) -> PoseEstimator | None:
         from perception.estimator import LearnedEstimator
 
         torch.set_num_threads(1)  # sums must not depend on how many scenes run side by side
-        _ESTIMATORS[config] = LearnedEstimator(config.weights, part_names=config.parts)
+        _ESTIMATORS[config] = LearnedEstimator(config.weights, part_names=config.parts, parts_dir=config.parts_dir)
     return _ESTIMATORS[config]
 
 

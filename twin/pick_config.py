@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cad.parts import part_names
+from cad.parts import BUILT_IN, part_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,8 +18,12 @@ class PickConfig:
     """Scenes, each with fresh parts and a fresh camera placement."""
     parts_per_class: int = 2
     """Parts of each class in a scene."""
-    parts: tuple[str, ...] = ("inserted", "main", "top")
+    parts: tuple[str, ...] = BUILT_IN
     """Part classes to drop."""
+    parts_dir: Path | None = None
+    """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
+    arm_calibration: Path | None = None
+    """Factory calibration of one arm (calibration.conf or ROS's YAML); the nominal arm when left out."""
     seed: int = 0
     """Seed of the scenes; the same seed gives the same scorecard."""
     estimator: Literal["learned", "oracle"] = "learned"
@@ -40,7 +44,7 @@ class PickConfig:
                 raise ValueError(f"{name.replace('_', '-')} is {value}; it must be between 1 and {most}")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; it must not be negative")
-        known = part_names()
+        known = part_names(self.parts_dir)
         unknown = [p for p in self.parts if p not in known]
         if unknown or not self.parts:
             raise ValueError(

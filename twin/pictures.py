@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.parts import load_part
+from cad.parts import Part
 from cad.spatial import Array, Intrinsics, apply, inverse
 from perception.estimates import Frame, FrameEstimate, PartEstimate
 from perception.silhouette import silhouette_mask
@@ -24,13 +24,19 @@ INSET = 300  # pixels of the frame shown full size around a part
 OVERVIEW = 4  # the frame is shown at a quarter of its size
 
 
-def annotate(frame: Frame, estimate: FrameEstimate, chosen: Array | None = None, opening_m: float = 0.0) -> Image:
+def annotate(
+    frame: Frame,
+    estimate: FrameEstimate,
+    parts: Mapping[str, Part],
+    chosen: Array | None = None,
+    opening_m: float = 0.0,
+) -> Image:
     """The frame with masks, boxes and axes, the chosen grasp, and a full-size inset of every part.
 
     ``chosen`` is ``T_cam_tcp`` (4, 4) of the grasp to come and ``opening_m`` the opening of the fingers. A part without
-    a mask is drawn with the silhouette of its CAD at the estimated pose. Returns RGB.
+    a mask is drawn with the silhouette of its CAD, from ``parts`` by name, at the estimated pose. Returns RGB.
     """
-    estimate = replace(estimate, parts=tuple(_with_mask(p, frame.intrinsics) for p in estimate.parts))
+    estimate = replace(estimate, parts=tuple(_with_mask(p, parts, frame.intrinsics) for p in estimate.parts))
     size = frame.intrinsics.width // OVERVIEW, frame.intrinsics.height // OVERVIEW
     overview = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
     for part in estimate.parts:
@@ -55,10 +61,10 @@ def save_picture(path: Path, image: Image) -> None:
     os.replace(temporary, path)
 
 
-def _with_mask(part: PartEstimate, camera: Intrinsics) -> PartEstimate:
+def _with_mask(part: PartEstimate, parts: Mapping[str, Part], camera: Intrinsics) -> PartEstimate:
     if part.mask is not None:
         return part
-    mask, origin = silhouette_mask(load_part(part.part), part.T_cam_part, camera)
+    mask, origin = silhouette_mask(parts[part.part], part.T_cam_part, camera)
     return replace(part, mask=mask, mask_origin=origin)
 
 

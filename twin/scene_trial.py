@@ -70,7 +70,7 @@ class SceneTrial:
         place, mount, noise = np.random.SeedSequence([config.seed, scene]).spawn(3)
         self._watch = Stopwatch()
         instances = [name for name in config.parts for _ in range(config.parts_per_class)]
-        self._classes = {name: load_part(name) for name in config.parts}
+        self._classes = {name: load_part(name, config.parts_dir) for name in config.parts}
         self._parts: list[Part] = [self._classes[name] for name in instances]
         T_world_part = settle_parts(cell, instances, np.random.default_rng(place))
         self._watch.lap("settle")
@@ -178,7 +178,7 @@ class SceneTrial:
             chosen = grasp_in_camera(attempt.T_base_tcp, self._cell.T_world_board, estimate.T_cam_board)
             opening = attempt.approach_opening_m or 0.0
         name = f"scene_{self._scene:03d}_time_{frame.time_s:07.2f}.jpg"
-        save_picture(self._config.out / "frames" / name, annotate(frame, estimate, chosen, opening))
+        save_picture(self._config.out / "frames" / name, annotate(frame, estimate, self._classes, chosen, opening))
         self._watch.lap("pictures")
 
     def _nearest(self, T_world_part: Array, name: str) -> int | None:

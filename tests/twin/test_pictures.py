@@ -1,9 +1,12 @@
 import cv2
 import numpy as np
 
+from cad.parts import load_part
 from cad.spatial import BASLER, rotation_x, transform
 from perception.estimates import Frame, FrameEstimate, PartEstimate
 from twin.pictures import INSET, annotate, save_picture
+
+PARTS = {name: load_part(name) for name in ("main", "top")}
 
 
 def test_an_annotated_frame_shows_every_part(tmp_path):
@@ -23,10 +26,10 @@ def test_an_annotated_frame_shows_every_part(tmp_path):
     )
     estimate = FrameEstimate(T_cam_board=np.eye(4), parts=parts, tags_seen=20, tag_rms_px=0.05)
     grasp = transform(None, parts[0].T_cam_part[:3, 3])
-    picture = annotate(frame, estimate, grasp, 0.015)
+    picture = annotate(frame, estimate, PARTS, grasp, 0.015)
     assert picture.shape[1] == BASLER.width // 4
     assert picture.shape[0] == BASLER.height // 4 + INSET + 4
-    plain = annotate(frame, FrameEstimate(T_cam_board=np.eye(4), parts=(), tags_seen=20, tag_rms_px=0.05))
+    plain = annotate(frame, FrameEstimate(T_cam_board=np.eye(4), parts=(), tags_seen=20, tag_rms_px=0.05), PARTS)
     for part in parts:  # each part leaves a mark around its place in the overview
         u, v = (BASLER.project(part.T_cam_part[:3, 3]) / 4).astype(int)
         window = np.s_[v - 15 : v + 15, u - 15 : u + 15]
