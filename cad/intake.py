@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,10 @@ from cad.meshes import MeshError, check_mesh
 from cad.soup import Soup
 from cad.sources import CAD_SUFFIXES, read_bytes, read_triangles
 from cad.step import declared_unit, read_step
-from cad.surface import outer_surface
+from cad.surface import RepairConfig, outer_surface
 
 METRES_PER_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "in": 25.4e-3, "ft": 304.8e-3}
 """The units of length that files come in."""
-_REPORTED = 1e-3  # smallest share of the volume whose filling is worth a line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,41 +23,34 @@ class IntakeConfig:
     """What is taken in without a question, and how closely.
 
     ``size_mm``: range of the largest side of the bounding box that a part may have without ``accept_size``. The Hand-E
-    opens 50 mm, so nothing longer can be taken at any angle, and the camera sees 1 mm as 20 to 40 pixels, too few for
-    a pose. A part of 1 to 50 mm whose numbers are taken for inches or metres, or the other way round, falls outside.
+    opens 50 mm, so nothing longer can be taken at any angle, and 1 mm is a few tens of pixels in the picture, too few
+    for a pose. A part under 25 mm falls outside when its inches or metres are taken for millimetres, and one over 2 mm
+    when its millimetres are taken for inches.
 
-    ``gap_m``: gaps in a surface up to this width are closed by moving vertices; wider ones are filled.
-
-    ``triangles``: a surface of more is simplified, no point moving further than ``simplify_m``.
-
-    ``wrap_cells``: cells along the longest side of a surface that cannot be repaired and is wrapped instead.
+    ``time_limit_s`` is for the CAD kernel.
     """
 
     size_mm: tuple[float, float] = (1.0, 50.0)
-    gap_m: float = 10e-6
-    triangles: int = 20_000
-    simplify_m: float = 2e-6
-    wrap_cells: int = 160
     time_limit_s: float = 120.0
+    repair: RepairConfig = field(default_factory=RepairConfig)
 
     def __post_init__(self) -> None:
         low, high = self.size_mm
         if not 0 < low < high:
             raise ValueError(f"size_mm {self.size_mm}: two sizes in mm, the smaller first")
-        for key in ("gap_m", "simplify_m", "time_limit_s"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} {getattr(self, key)}: it must be positive")
-        if self.triangles < 4 or not 16 <= self.wrap_cells <= 512:
-            raise ValueError(f"triangles {self.triangles} (4 or more), wrap_cells {self.wrap_cells} (16 to 512)")
+        if not self.time_limit_s > 0:
+            raise ValueError(f"time_limit_s {self.time_limit_s}: it must be positive")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intake:
     """A part as it was taken in.
 
-    ``mesh`` is the outer surface of the union of all solids, watertight, in metres, in the file's frame; ``solids`` is
-    how many closed shells the file holds; ``unit`` is what the file's numbers are in and ``unit_source`` how that is
-    known; ``size_mm`` (3,) is the bounding box; ``notes`` say, for a person to read, what was changed and how much.
+    ``mesh`` is the outer surface of the union of all solids, watertight, in metres; ``solids`` is how many closed
+    shells the file holds; ``unit`` is what the file's numbers are in and ``unit_source`` how that is known;
+    ``size_mm`` (3,) is the bounding box; ``origin_m`` (3,) is where the mesh's origin lies in the file's frame (zero
+    unless the part lies far from the file's origin), the axes being the file's; ``notes`` say, for a person to read,
+    what was changed and by how much.
     """
 
     mesh: trimesh.Trimesh
@@ -66,6 +58,7 @@ class Intake:
     unit: str
     unit_source: str
     size_mm: tuple[float, float, float]
+    origin_m: tuple[float, float, float]
     notes: tuple[str, ...]
 
 
@@ -93,10 +86,19 @@ def read_part(
         scale = METRES_PER_UNIT[unit]
     soups = [Soup(vertices=scale * soup.vertices, faces=soup.faces) for soup in soups]
     _check_size(name, soups, unit, accept_size, config)
-    mesh, solids, notes = outer_surface(soups, name, config)
+    mesh, solids, notes = outer_surface(soups, name, config.repair)
+    origin = _recentre(mesh, notes)
     check_mesh(mesh, name)
-    size = tuple(float(side) for side in 1e3 * mesh.extents)
-    return Intake(mesh=mesh, solids=solids, unit=unit, unit_source=source, size_mm=size, notes=tuple(notes))
+    x, y, z = (round(1e3 * float(side), 6) for side in mesh.extents)
+    return Intake(
+        mesh=mesh,
+        solids=solids,
+        unit=unit,
+        unit_source=source,
+        size_mm=(x, y, z),
+        origin_m=origin,
+        notes=tuple(notes),
+    )
 
 
 def _step_scale(name: str, declared: str | None, unit: str | None) -> tuple[float, str, str]:
@@ -106,6 +108,20 @@ def _step_scale(name: str, declared: str | None, unit: str | None) -> tuple[floa
     if declared is None:
         raise MeshError(f"{name} names several or unusual units of its own; leave --unit away")
     return METRES_PER_UNIT[unit] / METRES_PER_UNIT[declared], unit, f"as asked (the file says {declared})"
+
+
+def _recentre(mesh: trimesh.Trimesh, notes: list[str]) -> tuple[float, float, float]:
+    """Move a mesh that lies farther from its origin than it is long to the middle of its bounding box."""
+    centre = np.asarray(mesh.bounds).mean(axis=0)
+    if np.linalg.norm(centre) <= mesh.extents.max():
+        return 0.0, 0.0, 0.0
+    mesh.apply_translation(-centre)
+    x, y, z = (float(value) for value in centre)
+    notes.append(
+        f"the part lies {1e3 * np.linalg.norm(centre):.3g} mm from the file's origin; its own origin is the middle of "
+        "its bounding box instead"
+    )
+    return x, y, z
 
 
 def _check_size(name: str, soups: list[Soup], unit: str, accept: bool, config: IntakeConfig) -> None:
