@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import shutil
 import tempfile
 import time
@@ -27,8 +28,7 @@ from scenes.stable_poses import StablePoseConfig, find_stable_poses, write_stabl
 from twin.grasps import write_grasps
 from twin.robot import TwinError
 
-_ASIDE = ".adding-"
-_REMOVED = ".removed-"
+_ASIDE, _REMOVED = ".adding", ".removed"
 
 
 class NewPartError(TwinError):
@@ -166,7 +166,8 @@ def _aside(root: Path, name: str) -> Iterator[Path]:
     """A folder ``name`` inside a hidden one in ``root``; whatever is left of it in the end is removed."""
     try:
         root.mkdir(parents=True, exist_ok=True)
-        hidden = Path(tempfile.mkdtemp(prefix=_ASIDE, dir=root))
+        _sweep(root)
+        hidden = _hidden(root, _ASIDE)
     except OSError as error:
         raise NewPartError(
             f"cannot write to {root} ({error.strerror}); choose another folder with --parts-dir"
@@ -198,6 +199,29 @@ def _put_in_place(folder: Path, root: Path) -> None:
 
 def _discard(folder: Path, root: Path) -> None:
     """Remove a part's folder: out of sight at once and as a whole, then file by file."""
-    hidden = Path(tempfile.mkdtemp(prefix=_REMOVED, dir=root))
+    hidden = _hidden(root, _REMOVED)
     folder.rename(hidden / folder.name)
     shutil.rmtree(hidden)
+
+
+def _hidden(root: Path, what: str) -> Path:
+    """A new folder whose name says which process made it."""
+    return Path(tempfile.mkdtemp(prefix=f"{what}-{os.getpid()}-", dir=root))
+
+
+def _sweep(root: Path) -> None:
+    """Remove what processes that were killed left."""
+    for folder in root.glob(".*-*-*"):
+        what, process, _ = folder.name.split("-", 2)
+        if what in (_ASIDE, _REMOVED) and process.isdigit() and not _is_alive(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
