@@ -1,8 +1,8 @@
 """Contact parameters for parts of a few millimetres and 0.3 g, and who may touch whom.
 
 MuJoCo's default contacts are meant for bodies of kilograms: at this scale parts rest 0.1 to 0.2 mm deep in the table
-and a grip of 20 N passes through them. The values here were found with watertight parts of 8 x 6 x 3 mm to
-9 x 7.5 x 3.6 mm and 0.3 g; ``margin`` stays 0 because it would float a part above the table.
+and a grip of 20 N passes through them. ``benchmarks/contact.py`` measures what the values here do to a part;
+``margin`` stays 0 because it would float a part above the table.
 """
 
 from __future__ import annotations
@@ -17,37 +17,48 @@ from scenes.gl import mujoco
 from scenes.render import COLLISION_GROUP
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX.value
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE.value
 _TYPES = {
     "box": BOX,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE.value,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER.value,
 }
-CONTACT_DIMENSIONS = 4
-"""Sliding and torsional friction: two opposed pads must be able to hold a part against turning."""
 
 
 class Touches(IntFlag):
-    """Collision groups as bits of ``contype`` and ``conaffinity``."""
+    """Collision groups as bits of ``contype`` and ``conaffinity``.
+
+    The board is there twice: as the ``PLATE`` that the robot meets, and as the ``LEVEL`` that parts lie on, an endless
+    plane at its top. On a box parts creep by up to 0.2 um/s and rock: where a facet of a part is almost parallel to the
+    box MuJoCo takes the contact's normal from the facet. A plane's normal is its own.
+    """
 
     NOTHING = 0
     CELL = 1
     PART = 2
     ROBOT = 4
+    PLATE = 8
+    LEVEL = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:
-    """MuJoCo's contact parameters of one kind of surface."""
+    """MuJoCo's contact parameters of one kind of surface.
+
+    ``friction`` is sliding (no unit), torsional (m) and rolling (m); ``dimensions`` of 4 leave rolling free, 6 do not.
+    """
 
     friction: tuple[float, float, float]
+    dimensions: int
     solref: tuple[float, float]
     solimp: tuple[float, float, float, float, float]
     priority: int = 0
 
 
-PART = Contact(friction=(0.4, 5e-4, 1e-4), solref=(0.004, 1.0), solimp=(0.95, 0.99, 1e-4, 0.5, 2.0))
-"""Parts, and the board and tray they lie on: 2.5 um deep at rest, creep of 0.05 um/s. Dry steel on painted plate."""
-ROBOT = Contact(friction=(0.4, 5e-4, 1e-4), solref=(0.004, 1.0), solimp=(0.95, 0.99, 1e-4, 0.5, 2.0))
+PART = Contact(friction=(0.4, 5e-4, 5e-5), dimensions=6, solref=(0.004, 1.0), solimp=(0.95, 0.99, 1e-4, 0.5, 2.0))
+"""Parts, and the board and tray they lie on, up to 4 um deep: dry steel on painted plate. Without rolling friction a
+screw on its side rolls for seconds."""
+ROBOT = Contact(friction=(0.4, 5e-4, 5e-5), dimensions=4, solref=(0.004, 1.0), solimp=(0.95, 0.99, 1e-4, 0.5, 2.0))
 """Arm and hand housings: they should never touch anything, and are as stiff as the parts when they do."""
 
 
@@ -55,10 +66,12 @@ def pad_contact(timestep_s: float) -> Contact:
     """The gripper's pads, which decide alone (priority 1): as stiff as the time step allows.
 
     A time constant of two steps is the shortest MuJoCo accepts. With (0.9, 0.95, 1e-3) for the impedance a part of
-    0.3 g is squeezed out or passed through at 20 N; with these it is squeezed by 17 um.
+    0.3 g is squeezed out or passed through at 20 N; with these 0.1 g are squeezed by 14 um. Torsional friction keeps a
+    part held between two points from turning.
     """
     return Contact(
         friction=(PAD_FRICTION, 0.003, 1e-4),
+        dimensions=4,
         solref=(2 * timestep_s, 1.0),
         solimp=(0.999, 0.9999, 1e-5, 0.5, 2.0),
         priority=1,
@@ -67,20 +80,23 @@ def pad_contact(timestep_s: float) -> Contact:
 
 _PARTNERS = {
     Touches.CELL: Touches.PART | Touches.ROBOT,
-    Touches.PART: Touches.CELL | Touches.PART | Touches.ROBOT,
-    Touches.ROBOT: Touches.CELL | Touches.PART,
+    Touches.PART: Touches.CELL | Touches.PART | Touches.ROBOT | Touches.LEVEL,
+    Touches.ROBOT: Touches.CELL | Touches.PART | Touches.PLATE,
+    Touches.PLATE: Touches.ROBOT,
+    Touches.LEVEL: Touches.PART,
 }
 
 
 def make_collision(geom: mujoco.MjsGeom, kind: Touches, contact: Contact) -> None:
     """Turn a geom into a massless collision geom of one group; it is not drawn.
 
-    The cell's fixed parts never meet each other, nor do the links of the robot; everything else does.
+    The cell's fixed parts never meet each other, nor do the links of the robot; everything else does, but for what
+    :class:`Touches` says of the board.
     """
     geom.group = COLLISION_GROUP
     geom.mass = 0.0
     geom.contype, geom.conaffinity = int(kind), int(_PARTNERS[kind])
-    geom.condim = CONTACT_DIMENSIONS
+    geom.condim = contact.dimensions
     geom.friction, geom.solref, geom.solimp = contact.friction, contact.solref, contact.solimp
     geom.priority = contact.priority
 
@@ -94,13 +110,17 @@ def add_primitive(body: mujoco.MjsBody, solid: Primitive, kind: Touches, contact
 
 
 def set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
-    """Solver settings: 0.5 ms or less while a part is carried (it slips 23 um over 100 mm then, 178 um at 2 ms)."""
+    """Solver settings.
+
+    With an ``impratio`` of 10 a part held by facets that are not quite parallel to the pads creeps by 22 um in 5 s,
+    with 100 by 2 um, at no cost.
+    """
     spec.compiler.degree = False
     option = spec.option
     option.timestep = timestep_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST.value
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC.value
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON.value
-    option.impratio = 10.0
+    option.impratio = 100.0
     option.tolerance = 1e-10
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP.value

@@ -14,7 +14,7 @@ from cad.station import COLLISION, TABLE_THICKNESS_M, TABLE_X_M, TABLE_Y_M
 from scenes.arm import add_arm
 from scenes.camera import add_camera
 from scenes.cell_config import CellConfig, TrayConfig
-from scenes.contacts import BOX, PART, Touches, add_primitive, make_collision, set_options
+from scenes.contacts import BOX, PART, PLANE, ROBOT, Touches, add_primitive, make_collision, set_options
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_part_material, add_visual, classic_finish
 from scenes.randomize import DEFAULT_AMBIENT, DEFAULT_LAMPS
@@ -115,7 +115,9 @@ def _add_board(spec: mujoco.MjSpec, config: CellConfig) -> mujoco.MjsBody:
     body = spec.worldbody.add_body(name="board", pos=T[:3, 3], quat=quat_wxyz_from_rotation(T[:3, :3]))
     half = [board.width_m / 2, board.height_m / 2, board.thickness_m / 2]
     geom = body.add_geom(name="board", type=BOX, size=half, pos=[0.0, 0.0, -half[2]])
-    make_collision(geom, Touches.CELL, PART)
+    make_collision(geom, Touches.PLATE, ROBOT)
+    level = spec.worldbody.add_geom(name="board_level", type=PLANE, size=half, pos=body.pos, quat=body.quat)
+    make_collision(level, Touches.LEVEL, PART)
     add_board_visuals(spec, body, board)
     return body
 
