@@ -79,6 +79,7 @@ class SimRobot:
         self._dofs = np.array([j.dofadr[0] for j in joints])
         self._arm_inputs = arm_inputs(model)
         self._hand = SimHand(model, data)
+        self._hold_s = (self._config.control_period_s + float(model.opt.timestep)) / 2
         self._inertia = np.zeros(model.nv)
         self._q_target = data.qpos[self._qpos].copy()
         self._command(self._q_target, np.zeros(6), np.zeros(6))
@@ -178,14 +179,17 @@ class SimRobot:
         self._check_finite()
 
     def _command(self, q: Array, qd: Array, qdd: Array) -> None:
-        """Set points of the servos; the torque that the acceleration needs is fed forward."""
+        """Bring the servos to ``q``, ``qd`` (6,) by the end of the period; the torque for ``qdd`` is fed forward.
+
+        Servos hold their set points for a whole period and follow them on average: what they get is that of its middle.
+        """
         torque = qdd
         if qdd.any():
             acceleration = np.zeros(self._model.nv)
             acceleration[self._dofs] = qdd
             mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
             torque = self._inertia[self._dofs]
-        self._data.ctrl[self._arm_inputs] = q, qd, torque
+        self._data.ctrl[self._arm_inputs] = q - self._hold_s * qd, qd - self._hold_s * qdd, torque
 
     def _period(self) -> None:
         """One control period of the hand's controller and of physics."""
