@@ -99,7 +99,7 @@ def kinematics(cell: CellConfig, rng: np.random.Generator) -> Section:
         for q in rng.uniform(-np.pi, np.pi, (1000, 6))
     ]
     return Section(
-        title="Flange of the compiled model against the closed form, 1,000 joint vectors; distance from the nominal arm's",
+        title="Flange of the compiled model against the closed form, 1,000 joint vectors; and from the nominal arm's",
         columns=("max m", "max rad", "from nominal, mean mm", "max mm"),
         rows=[(f"{max(metres):.1e}", f"{max(angles):.1e}", f"{1e3 * np.mean(off):.3f}", f"{1e3 * max(off):.3f}")],
     )
@@ -217,18 +217,8 @@ def tracking(cell: CellConfig, options: ArmBenchmark, rng: np.random.Generator) 
         row = (name, f"{v:.2f}", f"{a:.2f}", f"{rms[0]:.4f}", f"{largest[0]:.4f}", f"{rms[1]:.0f}", f"{largest[1]:.0f}")
         rows.append((*row, f"{speed:.0%}", f"{torque:.0%}"))
     return Section(
-        title=f"Tracking over {options.cycles} pick cycles (rad/s for moveJ, m/s for moveL); peaks as shares of the limits",
-        columns=(
-            "move",
-            "speed",
-            "accel.",
-            "TCP rms mm",
-            "max mm",
-            "joint rms urad",
-            "max urad",
-            "peak speed",
-            "torque",
-        ),
+        title=f"Tracking over {options.cycles} pick cycles (moveJ in rad/s, moveL in m/s); peaks as shares of limits",
+        columns=("move", "speed", "accel.", "TCP rms mm", "max mm", "joint rms urad", "max urad", "speed", "torque"),
         rows=rows,
     )
 

@@ -9,8 +9,9 @@ from cad.robot import SPEED_LIMIT_RAD_S, forward_kinematics
 from cad.spatial import rotation_angle
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_workcell
+from twin.attempts import ControllerConfig
 from twin.ik import top_down
-from twin.profiles import LinearPath, ProfileError
+from twin.profiles import JointPath, LinearPath, ProfileError
 from twin.robot import GripState, MotionRefused, RobotError
 from twin.sim_robot import SimRobot, SimRobotConfig
 
@@ -59,12 +60,29 @@ def test_linear_move_keeps_to_the_line_and_to_its_speed():
     line = (end - START)[:3, 3] / np.linalg.norm((end - START)[:3, 3])
     offsets = np.array(trace) - START[:3, 3]
     off = np.linalg.norm(offsets - np.outer(offsets @ line, line), axis=1)
-    assert off.max() < 0.2e-3
+    assert off.max() < 0.05e-3
     times = MODEL.opt.timestep * np.arange(1, len(trace) + 1)
     lag = [np.linalg.norm(p - path.at(t)[:3, 3]) for t, p in zip(times, trace, strict=True)]
-    assert max(lag) < 1e-3
+    assert max(lag) < 0.2e-3
     assert (np.abs(speeds) <= SPEED_LIMIT_RAD_S).all()
     assert np.linalg.norm(trace[-1] - end[:3, 3]) < 20e-6
+
+
+def test_joint_move_keeps_to_its_profile_at_the_speed_of_a_pick():
+    robot, data = make_robot()
+    config, q = ControllerConfig(), robot.ik.solve(START)
+    path = JointPath(
+        q_start=np.array(CELL.home_q), q_end=q, speed=config.joint_speed, acceleration=config.joint_acceleration
+    )
+    trace = []
+    robot.on_step = lambda: trace.append((data.time, data.qpos[:6].copy()))
+    robot.move_j(q, speed=config.joint_speed, acceleration=config.joint_acceleration)
+    ends = trace[3::4]  # where a control period of four steps ends
+    joints = np.array([np.abs(actual - path.at(time)[0]).max() for time, actual in ends])
+    tools = [(forward_kinematics(a)[6] - forward_kinematics(path.at(t)[0])[6])[:3, 3] for t, a in ends]
+    assert joints.max() < 3e-4
+    assert np.linalg.norm(tools, axis=1).max() < 0.3e-3
+    assert np.abs(np.diff([a for _, a in ends], axis=0)).max() / 0.002 > 0.7 * config.joint_speed
 
 
 def test_observation_is_what_nominal_kinematics_make_of_the_encoders():
