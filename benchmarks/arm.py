@@ -1,37 +1,29 @@
-"""How exactly the simulated arm and hand do what they are told: python -m benchmarks.arm.
+"""How exactly the simulated arm does what it is told: python -m benchmarks.arm.
 
-Kinematics against the closed form, static and tracking error of the TCP at the speeds of scored picks, force, speed
-and object detection of the hand.
+The compiled model against the published tables and the closed form, static and tracking error of the TCP at the speeds
+of scored picks.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
-from cad import gripper, robot
+from benchmarks.tables import Section, show
+from cad import robot
 from cad.robot_calibration import read_dh_calibration
-from cad.spatial import Array, apply, quat_wxyz_from_rotation, rotation_angle, transform
-from scenes.arm import FINGER_JOINTS
-from scenes.contacts import BOX, PART, Touches, make_collision
+from cad.spatial import Array, apply, rotation_angle, transform
+from scenes.arm import FORCE_NUMERIC, GRIPPER_ACTUATOR, SPEED_NUMERIC
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_arm
 from twin.attempts import ControllerConfig
 from twin.ik import top_down
 from twin.profiles import JointPath, LinearPath, speed_for
 from twin.sim_robot import SimRobot, SimRobotConfig
-
-BLOCK_M = 0.008
-"""Width of the block that the hand grips."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,38 +42,40 @@ class ArmBenchmark:
     """Print JSON instead of tables."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Section:
-    """One table: a title, column heads and rows."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-
-def make_robot(cell: CellConfig, *, block: bool = False, wall: bool = False) -> tuple[SimRobot, mujoco.MjData]:
-    """Arm and hand at home, fingers at 20 mm; a floating block between the pads, or fixed ones outside them."""
-    spec = build_arm(cell)
-    T = robot.forward_kinematics(cell.home_q, cell.arm)[6] @ gripper.T_FLANGE_TCP
-    solids = [("block", 0.0, BLOCK_M / 2, Touches.PART)] if block else []
-    if wall:
-        solids += [(f"wall_{s:+.0f}", s * 0.0225, 0.005, Touches.CELL) for s in (1.0, -1.0)]
-    for name, x, half, kind in solids:
-        place = T @ transform(t=[x, 0.0, -0.004])
-        quat = quat_wxyz_from_rotation(T[:3, :3])
-        body = spec.worldbody.add_body(name=name, pos=place[:3, 3], quat=quat, gravcomp=1.0)
-        if kind is Touches.PART:
-            body.add_freejoint(name=name)
-        geom = body.add_geom(name=name, type=BOX, size=[half, 0.003, 0.003])
-        make_collision(geom, kind, PART)
-        geom.mass = 0.0003
-    model = spec.compile()
+def make_robot(cell: CellConfig) -> tuple[SimRobot, mujoco.MjData]:
+    """Arm and hand at home."""
+    model = build_arm(cell).compile()
     data = mujoco.MjData(model)
     data.qpos[:6] = cell.home_q
-    for name in FINGER_JOINTS:
-        data.joint(name).qpos[0] = 0.010
     mujoco.mj_forward(model, data)
     return SimRobot(model, data, cell), data
+
+
+def compiled_model(cell: CellConfig) -> list[Section]:
+    """What the compiled model holds of the published tables."""
+    model, rows = build_arm(cell).compile(), []
+    for name, joint in zip(robot.BODY_NAMES[1:], robot.JOINT_NAMES, strict=True):
+        body, (positions, speeds, torques) = model.body(name), np.degrees(model.actuator(joint).ctrlrange)
+        com = ", ".join(f"{v:g}" for v in 1e3 * body.ipos)
+        limits = (f"{positions[1]:.0f}", f"{speeds[1]:.0f}", f"{np.radians(torques[1]):.0f}")
+        rows.append((name.removeprefix("ur5e_"), f"{body.mass[0]:g}", com, *limits))
+    hand = model.actuator(GRIPPER_ACTUATOR).ctrlrange
+    ranges = [model.numeric(name).data for name in (FORCE_NUMERIC, SPEED_NUMERIC)]
+    force, speed = (
+        f"{scale * low:.0f} .. {scale * high:.0f}" for scale, (low, high) in zip((1, 1e3), ranges, strict=True)
+    )
+    return [
+        Section(
+            title="Compiled arm",
+            columns=("link", "mass kg", "centre of mass mm", "+- degrees", "degrees/s", "N m"),
+            rows=rows,
+        ),
+        Section(
+            title="Compiled hand",
+            columns=("stroke mm", "force N", "speed mm/s"),
+            rows=[(f"{1e3 * hand[0, 1]:.0f}", force, speed)],
+        ),
+    ]
 
 
 def kinematics(cell: CellConfig, rng: np.random.Generator) -> Section:
@@ -223,91 +217,14 @@ def tracking(cell: CellConfig, options: ArmBenchmark, rng: np.random.Generator) 
     )
 
 
-def hand_force(cell: CellConfig) -> Section:
-    """Normal force on each pad that squeezes a block of 0.3 g, against the command."""
-    rows = []
-    for force in (20.0, 40.0, 60.0, 80.0, 100.0, 130.0):
-        machine, data = make_robot(cell, block=True)
-        state = machine.grip(0.004, force_n=force, speed=0.030)
-        sides, wrench = {"pad_left": 0.0, "pad_right": 0.0}, np.zeros(6)
-        for i, contact in enumerate(data.contact):
-            mujoco.mj_contactForce(data.model, data, i, wrench)
-            for geom in (contact.geom1, contact.geom2):
-                name = data.model.geom(geom).name
-                sides[name] = sides.get(name, 0.0) + wrench[0]
-        squeeze = 1e6 * (BLOCK_M - state.opening_m)
-        rows.append(
-            (f"{force:.0f}", f"{sides['pad_left']:.2f}", f"{sides['pad_right']:.2f}", f"{squeeze:.0f}", state.grip.name)
-        )
-    return Section(
-        title=f"Hand: normal force on each pad round a block of {1e3 * BLOCK_M:.0f} mm",
-        columns=("command N", "left N", "right N", "squeeze um", "state"),
-        rows=rows,
-    )
-
-
-def hand_speed(cell: CellConfig) -> Section:
-    """Speed of the opening over its middle 40 mm, against the command."""
-    rows = []
-    for speed in (0.020, 0.050, 0.100, 0.150):
-        machine, data = make_robot(cell)
-        machine.grip(gripper.STROKE_M, force_n=gripper.FORCE_RANGE_N[0], speed=speed)
-        measured = [_measure_speed(machine, data, end, speed) for end in (0.0, gripper.STROKE_M)]
-        (closing, short), (opening, over) = measured
-        row = (f"{1e3 * speed:.0f}", f"{-1e3 * closing:.2f}", f"{1e3 * opening:.2f}")
-        rows.append((*row, f"{1e6 * max(abs(short), abs(over)):.0f}"))
-    return Section(
-        title="Hand: speed over the middle 40 mm of the stroke, opening reached at the ends",
-        columns=("command mm/s", "closing mm/s", "opening mm/s", "off the end um"),
-        rows=rows,
-    )
-
-
-def _measure_speed(machine: SimRobot, data: mujoco.MjData, end: float, speed: float) -> tuple[float, float]:
-    """Speed over the middle of the stroke and how far from ``end`` the fingers come to rest, m/s and m."""
-    trace = []
-    machine.on_step = lambda: trace.append((data.time, data.ten_length[0]))
-    reached = machine.grip(end, force_n=gripper.FORCE_RANGE_N[0], speed=speed).opening_m
-    times, openings = np.array(trace).T
-    middle = np.abs(openings - gripper.STROKE_M / 2) < 0.4 * gripper.STROKE_M
-    return float(np.polyfit(times[middle], openings[middle], 1)[0]), reached - end
-
-
-def hand_states(cell: CellConfig) -> Section:
-    """What the hand reports in each situation of its object detection."""
-    rows = [("closed on nothing", make_robot(cell)[0].grip(0.0, force_n=20.0, speed=0.1).grip.name)]
-    machine, data = make_robot(cell, block=True)
-    rows.append(("closed on a block", machine.grip(0.002, force_n=20.0, speed=0.1).grip.name))
-    data.joint("block").qpos[:3] += [0.0, 0.0, 0.5]
-    machine.wait(0.010)
-    rows.append(("10 ms after the block is lost", machine.observe().grip.name))
-    machine.wait(0.3)
-    rows.append(("once the fingers have gone on", machine.observe().grip.name))
-    state = make_robot(cell, wall=True)[0].grip(0.045, force_n=20.0, speed=0.1)
-    rows.append(("opened against walls", state.grip.name))
-    return Section(title="Hand: object detection", columns=("situation", "state"), rows=rows)
-
-
 def main(options: ArmBenchmark) -> None:
     """Measure and print."""
     table = read_dh_calibration(options.arm_calibration) if options.arm_calibration else robot.UR5E
     cell = CellConfig(arm=table, timestep_s=options.timestep_s)
     rng = np.random.default_rng(options.seed)
-    sections = [kinematics(cell, rng), static_error(cell, options, rng), tracking(cell, options, rng)]
-    sections += [hand_force(cell), hand_speed(cell), hand_states(cell)]
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, mujoco "
-    machine += f"{mujoco.__version__}, time step {1e3 * options.timestep_s:g} ms, seed {options.seed}"
-    if options.json:
-        tables = {s.title: [dict(zip(s.columns, row, strict=True)) for row in s.rows] for s in sections}
-        print(json.dumps({"machine": machine, "tables": tables}, indent=2))
-        return
-    console = Console()
-    for section in sections:
-        drawn = Table(*section.columns, title=section.title, title_justify="left")
-        for row in section.rows:
-            drawn.add_row(*row)
-        console.print(drawn)
-    console.print(machine, highlight=False)
+    sections = [*compiled_model(cell), kinematics(cell, rng), static_error(cell, options, rng)]
+    sections.append(tracking(cell, options, rng))
+    show(sections, f"time step {1e3 * options.timestep_s:g} ms, seed {options.seed}", as_json=options.json)
 
 
 if __name__ == "__main__":
