@@ -18,8 +18,8 @@ from cad.spatial import Array, rotation_x, rotation_z, transform
 
 MAX_SHIFT_M, MAX_TILT = 0.010, np.radians(2.0)
 """A joint axis further from the nominal arm's than this means a file of another model. Two factory files that owners
-published (a UR10 and a UR3) shift the axes by up to 3.2 mm and tilt them by up to 0.6 degrees; the deltas of one model
-on the table of another shift them by 30 mm and more."""
+published (a UR10 and a UR3) shift the axes by up to 4 mm and tilt them by up to 0.6 degrees; the deltas of one size on
+the table of another shift them by 80 mm and more."""
 CALIBRATED = 2
 """Controller's ``calibration_status`` of an arm whose deltas are in use (0: none, 1: not linearised)."""
 ROS_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

@@ -36,7 +36,7 @@ class SimHand:
         self._actuator = model.actuator(GRIPPER_ACTUATOR).id
         self._inputs = hand_inputs(model)
         self._target = self._set_point = self.opening_m
-        self._speed = gripper.SPEED_RANGE_M_S[0]
+        self._direction, self._speed = 0.0, gripper.SPEED_RANGE_M_S[0]
         data.ctrl[self._inputs] = self._target, 0.0, 0.0
 
     @property
@@ -79,18 +79,25 @@ class SimHand:
         for name, value, (low, high), unit in checks:
             if not low <= value <= high:
                 raise MotionRefused(f"grip {name} {value} {unit} refused: the Hand-E's range is {low} to {high} {unit}")
+        direction = float(np.sign(opening_m - self.opening_m))
+        if not (self._stalled and direction == self._direction):  # a grip that is tightened never lets go
+            self._set_point = self.opening_m
         self._model.actuator_forcerange[self._actuator] = [-force_n, force_n]
-        self._target, self._speed, self._set_point = opening_m, speed, self.opening_m
+        self._target, self._speed, self._direction = opening_m, speed, direction
 
     def advance(self, period_s: float) -> None:
         """Move the set point on by one period, or push while the fingers cannot follow it."""
-        left = self._target - self._set_point
-        if left == 0.0 or self._stalled:
-            velocity, push = 0.0, np.sign(left) * self._force_n if self._stalled else 0.0
+        velocity = push = 0.0
+        if self._stalled:
+            push = self._direction * self._force_n
         else:
-            step = np.sign(left) * min(abs(left), self._speed * period_s)
-            self._set_point = self._target if abs(left) <= abs(step) else self._set_point + step
-            velocity, push = step / period_s, 0.0
+            if self._lag < -REACH_M:  # what held the fingers has gone
+                self._set_point = self.opening_m
+            left = self._target - self._set_point
+            velocity = float(np.clip(left / period_s, -self._speed, self._speed))
+            self._set_point = (
+                self._target if abs(left) <= self._speed * period_s else self._set_point + velocity * period_s
+            )
         self._data.ctrl[self._inputs] = self._set_point, velocity, push
 
     def stop(self) -> None:
@@ -98,6 +105,7 @@ class SimHand:
         if self.state in (GripState.CONTACT_CLOSING, GripState.CONTACT_OPENING):
             return
         self._target = self._set_point = self.opening_m
+        self._direction = 0.0
         self._data.ctrl[self._inputs] = self._target, 0.0, 0.0
 
     @property
@@ -105,10 +113,14 @@ class SimHand:
         return float(self._model.actuator_forcerange[self._actuator, 1])
 
     @property
+    def _lag(self) -> float:
+        """How far (m) the fingers are behind their set point on the way to the commanded opening."""
+        return (self._set_point - self.opening_m) * self._direction
+
+    @property
     def _stalled(self) -> bool:
-        """Whether the fingers are behind their set point: something is in their way."""
-        behind = self.opening_m - self._set_point
-        return abs(behind) > REACH_M and behind * (self.opening_m - self._target) > 0.0
+        """Whether something is in the fingers' way."""
+        return self._lag > REACH_M
 
     @property
     def _contact_force(self) -> float:

@@ -61,11 +61,11 @@ def pad_forces(model, data):
 
 
 @pytest.mark.parametrize("force", [20.0, 60.0, 130.0])
-@pytest.mark.parametrize("beyond_m", [0.001, 0.008])
+@pytest.mark.parametrize("beyond_m", [0.0004, 0.001, 0.008])
 def test_each_pad_presses_with_the_commanded_force(force, beyond_m):
     """However little the commanded opening lies below the part's width."""
     hand, model, data = make_robot(part=True)
-    state = hand.grip(WIDTH_M - beyond_m, force_n=force, speed=0.03)
+    state = hand.grip(WIDTH_M - beyond_m, force_n=force, speed=0.150)
     np.testing.assert_allclose(pad_forces(model, data), force, rtol=0.02)
     assert state.grip is GripState.CONTACT_CLOSING
     assert state.opening_m == pytest.approx(WIDTH_M, abs=0.1e-3)
@@ -133,12 +133,32 @@ def test_a_part_lost_from_the_grip_is_noticed_and_the_fingers_go_on():
     assert hand.observe().grip is GripState.CONTACT_CLOSING
     data.joint("part").qpos[:3] += [0.0, 0.0, 0.5]
     hand.wait(0.02)
+    assert hand.observe().opening_m > WIDTH_M - 0.002  # it lets fly only until the next control period
     speeds = []
     hand.on_step = lambda: speeds.append(np.abs(data.qvel[6:8]).sum())
     assert hand.observe().grip is GripState.MOVING
     hand.wait(0.3)
     assert hand.observe().grip is GripState.AT_POSITION and hand.observe().opening_m == pytest.approx(0.002, abs=1e-4)
     assert max(speeds) < 0.05
+
+
+@pytest.mark.parametrize("force", gripper.FORCE_RANGE_N)
+def test_fingers_whose_part_is_lost_do_not_pass_their_command(force):
+    hand, _, data = make_robot(part=True)
+    hand.grip(WIDTH_M - 0.0005, force_n=force, speed=0.03)
+    data.joint("part").qpos[:3] += [0.0, 0.0, 0.5]
+    hand.wait(0.4)
+    assert hand.observe().grip is GripState.AT_POSITION
+    assert hand.observe().opening_m == pytest.approx(WIDTH_M - 0.0005, abs=0.1e-3)
+
+
+def test_a_grip_that_is_tightened_never_lets_go():
+    hand, model, data = make_robot(part=True)
+    hand.grip(0.002, force_n=20.0, speed=0.03)
+    forces = []
+    hand.on_step = lambda: forces.append(pad_forces(model, data).min())
+    hand.grip(0.001, force_n=60.0, speed=0.03)
+    assert min(forces) > 15.0 and forces[-1] == pytest.approx(60.0, rel=0.02)
 
 
 def test_stop_halts_moving_fingers_and_keeps_a_grip():
