@@ -35,10 +35,9 @@ def add_arm(spec: mujoco.MjSpec, dh: robot.DhTable, *, timestep_s: float, grip_f
     _add_arm_actuators(spec)
     flange = links[-1]
     flange.add_site(name="flange", group=4)
-    _add_hand(spec, flange, grip_force_n)
-    for solid in (*robot.COLLISION, *gripper.COLLISION):
-        contact = pad_contact(timestep_s) if solid.touches else ROBOT
-        add_primitive(spec.body(solid.body), solid, Touches.ROBOT, contact)
+    add_hand(spec, flange, timestep_s=timestep_s, grip_force_n=grip_force_n)
+    for solid in robot.COLLISION:
+        add_primitive(spec.body(solid.body), solid, Touches.ROBOT, ROBOT)
 
 
 def _add_links(spec: mujoco.MjSpec, dh: robot.DhTable) -> list[mujoco.MjsBody]:
@@ -103,7 +102,8 @@ def hand_inputs(model: mujoco.MjModel) -> Array:
     return model.actuator_ctrladr[model.actuator(GRIPPER_ACTUATOR).id] + np.arange(3)
 
 
-def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, grip_force_n: float) -> None:
+def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, *, timestep_s: float, grip_force_n: float) -> None:
+    """Add the Hand-E to a body whose frame is ``flange``, with its fingers, their actuator and the site ``tcp``."""
     base = flange.add_body(name="hande_base", gravcomp=1.0)
     com = np.average(
         [gripper.BODY_COM_M, (0, 0, gripper.COUPLING_HEIGHT_M / 2)],
@@ -115,6 +115,9 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody, grip_force_n: float) 
     for name, sign in zip(FINGER_JOINTS, (1.0, -1.0), strict=True):
         _add_finger(base, name, sign)
     _couple_fingers(spec, grip_force_n)
+    for solid in gripper.COLLISION:
+        contact = pad_contact(timestep_s) if solid.touches else ROBOT
+        add_primitive(spec.body(solid.body), solid, Touches.ROBOT, contact)
 
 
 def _add_finger(base: mujoco.MjsBody, name: str, sign: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from cad import gripper, robot
 from cad.spatial import Array
 from perception.estimates import Frame, FrameEstimate
-from twin.grasps import Grasp
+from twin.grasp_config import Grasp
 
 Outcome = Literal["placed", "detection", "declined", "pose", "ik", "grasp", "transport", "place", "collision"]
 """How an attempt ended as far as the controller can tell: placed, or the reason why not."""

@@ -26,7 +26,8 @@ from twin.attempts import (
     Outcome,
 )
 from twin.grasp_choice import GraspChoice, PlacedPart, choose_grasp
-from twin.grasps import GraspConfig, read_grasps
+from twin.grasp_config import GraspConfig
+from twin.grasps import describe_grasps
 from twin.ik import ArmIk, IkError
 from twin.robot import Camera, MotionRefused, Robot, RobotError, TwinError
 
@@ -78,7 +79,7 @@ class PickController:
             raise ControllerError(f"no nests for {missing}; the calibration has {sorted(calibration.T_base_nests)}")
         self._robot, self._camera, self._estimator, self._ik = robot, camera, estimator, ik
         self._parts, self._calibration = dict(parts), calibration
-        self._grasps = {name: read_grasps(part) for name, part in parts.items()}
+        self._grasps = {name: describe_grasps(part) for name, part in parts.items()}
         self._config, self._grasp_config = config or ControllerConfig(), grasp_config or GraspConfig()
         self._on_event = on_event or (lambda event: None)
         self._in_nests: dict[str, dict[int, PlacedPart]] = {name: {} for name in parts}
@@ -162,6 +163,9 @@ class PickController:
 
     def _plan(self, candidate: Candidate, neighbours: list[PlacedPart]) -> Plan | tuple[Outcome, str]:
         name, k = candidate.estimate.part, candidate.estimate.stable_pose
+        known = self._grasps[name][k]
+        if known.why_not:
+            return "grasp", f"face {k} cannot be gripped: {known.why_not}"
         nests, filled = self._calibration.T_base_nests[name], self._in_nests[name]
         nest = next((n for n in range(len(nests)) if n not in filled), None)
         if nest is None:
@@ -172,7 +176,7 @@ class PickController:
             neighbours,
             T_base_part_at_nest,
             [p for nests in self._in_nests.values() for p in nests.values()],
-            self._grasps[name][k],
+            known.grasps,
             self._ik.solve,
             self._calibration.q_park,
             self._grasp_config,

@@ -12,8 +12,8 @@ import numpy as np
 from cad import gripper
 from cad.parts import Part
 from cad.spatial import Array, transform
+from twin.grasp_config import Grasp, GraspConfig
 from twin.grasp_geometry import convex_gap, footprint, rectangle
-from twin.grasps import Grasp, GraspConfig
 from twin.robot import TwinError
 
 
@@ -87,7 +87,7 @@ def _free_opening(
 ) -> float | None:
     """The widest opening at which the fingers, closing included, stay clear of every neighbour; None when none does."""
     outlines = [n.outline for n in neighbours]
-    for clearance in np.arange(config.clearance_m, config.min_clearance_m - 1e-9, -0.5e-3):
+    for clearance in np.arange(config.clearance_at(width_m), config.min_clearance_m - 1e-9, -0.5e-3):
         half = width_m / 2 + float(clearance)
         y = (-gripper.PAD_WIDTH_M / 2, gripper.PAD_WIDTH_M / 2)
         fingers = [

@@ -7,7 +7,8 @@ that (a, b, -z) is the right-handed tool frame: +x closing direction, +z approac
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 import trimesh
@@ -27,13 +28,21 @@ class PadStrip:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactRules:
-    """What counts as flat contact, in metres and radians."""
+    """What counts as a contact that holds, in metres and radians.
+
+    ``max_roll`` and ``max_bulge`` bound the contact's curvature times half the width, across and along its straightest
+    direction: 0 is flat and 1 a circle between the pads. A part rounder than a circle rolls over between them, and one
+    that is round both ways touches them in two points only.
+    """
 
     face_depth_m: float = 30e-6
     normal_tolerance: float = np.deg2rad(8.0)
     min_overlap_length_m: float = 0.6e-3
     min_overlap_height_m: float = 0.2e-3
     min_area_m2: float = 0.15e-6
+    flat_roll: float = 0.3
+    max_roll: float = 1.25
+    max_bulge: float = 0.5
     friction_table: float = 0.4
 
     def __post_init__(self) -> None:
@@ -41,6 +50,11 @@ class ContactRules:
             raise ValueError(
                 f"face depth {self.face_depth_m} m must be positive and the normal tolerance "
                 f"{self.normal_tolerance} rad between 0 and pi/4"
+            )
+        if not 0 < self.flat_roll <= self.max_bulge <= self.max_roll:
+            raise ValueError(
+                f"flat_roll {self.flat_roll}, max_bulge {self.max_bulge} and max_roll {self.max_roll} must be above 0 "
+                "and in this order"
             )
 
 
@@ -52,14 +66,18 @@ class SurfaceSamples:
     normals: Array
     area_m2: float
 
+    def moved(self, T: Array) -> SurfaceSamples:
+        """The samples in another frame: ``T`` (4, 4) maps into it."""
+        return replace(self, points=apply(T, self.points), normals=self.normals @ T[:3, :3].T)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PadContact:
-    """Two facing flat contacts. Lengths in metres; ``a_mid_m`` is the middle between the faces along a.
+    """Two facing contacts. Lengths in metres; ``a_mid_m`` is the middle between the faces along a.
 
     ``length_m`` and ``height_m`` measure the facing overlap along b and z, ``b_centre_m`` and ``z_centre_m`` its
     middle; ``flatness_m`` is the RMS depth of the touching samples under the extreme; ``z_touch_m`` the lowest touching
-    point.
+    point; ``roll`` the contact's largest curvature times half the width: 0 flat, 1 a circle between the pads.
     """
 
     width_m: float
@@ -71,11 +89,45 @@ class PadContact:
     z_centre_m: float
     z_touch_m: float
     flatness_m: float
+    roll: float
 
 
-def sample_surface(mesh: trimesh.Trimesh, spacing_m: float, seed: int = 0) -> SurfaceSamples:
-    """Samples spread evenly over ``mesh``, about ``spacing_m`` apart."""
-    count = max(1000, int(mesh.area / spacing_m**2))
+class Miss(Enum):
+    """Why two pads cannot take hold at one place. The value says it of the nearest miss, whose figure it quotes."""
+
+    NOTHING = "nothing between the pads"
+    NO_FACE = "nothing flat enough faces both pads: at best {:.3f} mm2, {:.3f} needed"
+    NOT_FACING = "the faces do not face each other: at best over {:.2f} mm, {:.2f} needed"
+    ROLLS = "round: it would roll between the pads (curvature x half width {:.2f}, at most {:.2f})"
+    POINT = (
+        "round in both directions: it would touch the pads in points (curvature x half width {:.2f}, at most {:.2f})"
+    )
+    WIDE = "wider than the gripper opens: {:.1f} mm, at most {:.1f} with room to come down"
+    THIN = "too thin for the hand to tell from nothing: {:.2f} mm, at least {:.2f}"
+    TIPS = "would tip over when one finger pushes it: stands on {:.2f} mm, {:.2f} needed"
+    HAND = "wider above the pads than between them: {:.1f} mm tall there, at most {:.1f}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Missed:
+    """A miss with its figure and the limit that it fails, in the units of its text; ``short`` is how far off it is."""
+
+    miss: Miss
+    figure: float = 0.0
+    limit: float = 0.0
+
+    @property
+    def short(self) -> float:
+        """How far the figure is from the limit, as a share of the limit."""
+        return abs(self.figure - self.limit) / max(self.limit, 1e-12)
+
+    def __str__(self) -> str:
+        return self.miss.value.format(self.figure, self.limit)
+
+
+def sample_surface(mesh: trimesh.Trimesh, spacing_m: float, max_count: int = 120_000, seed: int = 0) -> SurfaceSamples:
+    """Samples spread evenly over ``mesh``, about ``spacing_m`` apart, or wider on a surface too large for that."""
+    count = min(max(1000, int(mesh.area / spacing_m**2)), max_count)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     return SurfaceSamples(points=points, normals=mesh.face_normals[faces], area_m2=mesh.area / count)
 
@@ -88,12 +140,18 @@ def closing_axes(yaw: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, kw_only=True)
 class JawView:
-    """Samples between the heights of a strip, sorted by b: distance along a and b, height, facing = normal . a."""
+    """Samples between the heights of a strip, sorted by b.
+
+    Distances ``a`` and ``b`` along those axes and height ``z`` (N,); ``facing``, ``lean_b`` and ``lean_z`` (N,) are the
+    normal's components along a, b and z.
+    """
 
     a: Array
     b: Array
     z: Array
     facing: Array
+    lean_b: Array
+    lean_z: Array
     area_m2: float
 
 
@@ -105,51 +163,84 @@ def view_along(samples: SurfaceSamples, yaw: float, strip: PadStrip) -> JawView:
     b = samples.points[inside] @ axis_b
     order = np.argsort(b)
     inside = inside[order]
+    normals = samples.normals[inside]
     return JawView(
         a=samples.points[inside] @ axis_a,
         b=b[order],
         z=z[inside],
-        facing=samples.normals[inside] @ axis_a,
+        facing=normals @ axis_a,
+        lean_b=normals @ axis_b,
+        lean_z=normals[:, 2],
         area_m2=samples.area_m2,
     )
 
 
-def pad_contact(view: JawView, b_centre_m: float, strip: PadStrip, rules: ContactRules) -> PadContact | str:
-    """The flat contact of two pads with their middle at ``b_centre_m``, or why there is none.
+def pad_contact(view: JawView, b_centre_m: float, strip: PadStrip, rules: ContactRules) -> PadContact | Missed:
+    """The contact of two pads with their middle at ``b_centre_m``, or why there is none.
 
     Each pad stops at the extreme point in the strip; the samples within ``rules.face_depth_m`` of it whose normals face
-    the pad carry the contact.
+    the pad carry the contact. Faces, and straight round sides such as a screw's shank, can be held.
     """
     low, high = np.searchsorted(view.b, [b_centre_m - strip.half_width_m, b_centre_m + strip.half_width_m])
     if high - low < 10:
-        return "nothing between the pads"
+        return Missed(miss=Miss.NOTHING)
     a, b, z, facing = view.a[low:high], view.b[low:high], view.z[low:high], view.facing[low:high]
     a_min, a_max = float(a.min()), float(a.max())
+    width = a_max - a_min
     cos_limit = np.cos(rules.normal_tolerance)
     right = (a > a_max - rules.face_depth_m) & (facing > cos_limit)
     left = (a < a_min + rules.face_depth_m) & (facing < -cos_limit)
-    area = min(right.sum(), left.sum()) * view.area_m2
-    if area < rules.min_area_m2:
-        return "no flat face on one side"
-    b_low, b_high = max(b[right].min(), b[left].min()), min(b[right].max(), b[left].max())
-    z_low, z_high = max(z[right].min(), z[left].min()), min(z[right].max(), z[left].max())
-    if b_high - b_low < rules.min_overlap_length_m or z_high - z_low < rules.min_overlap_height_m:
-        return "the flat faces do not face each other"
-    depths = np.concatenate([a_max - a[right], a[left] - a_min])
+    sides = (np.flatnonzero(right), np.flatnonzero(left))
+    area = float(min(len(side) for side in sides) * view.area_m2)
+    if area < rules.min_area_m2 or min(len(side) for side in sides) < 4:
+        return Missed(miss=Miss.NO_FACE, figure=1e6 * area, limit=1e6 * rules.min_area_m2)
+    places = [np.column_stack([b[side], z[side]]) for side in sides]
+    leans = [np.column_stack([view.lean_b[low:high][side], view.lean_z[low:high][side]]) for side in sides]
+    curvature = np.mean([_curvature(p, n) for p, n in zip(places, leans, strict=True)], axis=0)
+    (bulge, roll), directions = np.linalg.eigh(curvature * width / 2)
+    reach, centre = _overlap(places, np.eye(2))
+    along = reach if roll < rules.flat_roll else np.array([_overlap(places, directions.T)[0][0], np.inf])
+    for length, needed in zip(along, (rules.min_overlap_length_m, rules.min_overlap_height_m), strict=True):
+        if length < needed:
+            return Missed(miss=Miss.NOT_FACING, figure=1e3 * max(0.0, float(length)), limit=1e3 * needed)
+    if bulge > rules.max_bulge:
+        return Missed(miss=Miss.POINT, figure=float(bulge), limit=rules.max_bulge)
+    if roll > rules.max_roll:
+        return Missed(miss=Miss.ROLLS, figure=float(roll), limit=rules.max_roll)
+    depths = np.concatenate([a_max - a[sides[0]], a[sides[1]] - a_min])
     return PadContact(
-        width_m=a_max - a_min,
+        width_m=width,
         a_mid_m=(a_max + a_min) / 2,
-        area_m2=float(area),
-        length_m=float(b_high - b_low),
-        height_m=float(z_high - z_low),
-        b_centre_m=float(b_high + b_low) / 2,
-        z_centre_m=float(z_high + z_low) / 2,
-        z_touch_m=float(max(z[right].min(), z[left].min())),
+        area_m2=area,
+        length_m=float(reach[0]),
+        height_m=float(reach[1]),
+        b_centre_m=float(centre[0]),
+        z_centre_m=float(centre[1]),
+        z_touch_m=float(max(p[:, 1].min() for p in places)),
         flatness_m=float(np.sqrt((depths**2).mean())),
+        roll=max(0.0, float(roll)),
     )
 
 
-def topples(contact: PadContact, yaw: float, base: Array, com: Array, friction_table: float) -> bool:
+def _curvature(places: Array, leans: Array) -> Array:
+    """Curvature (2, 2) in 1/m of a nearly flat patch, from its normals' leans (N, 2) at ``places`` (N, 2).
+
+    Least squares; a patch without extent in a direction counts as flat in it.
+    """
+    X, N = places - places.mean(axis=0), leans - leans.mean(axis=0)
+    K = np.linalg.solve(X.T @ X + len(X) * 1e-10 * np.eye(2), X.T @ N)
+    return (K + K.T) / 2
+
+
+def _overlap(places: list[Array], directions: Array) -> tuple[Array, Array]:
+    """Length (2,) over which the patches of both sides overlap along two directions (rows), and its middle."""
+    spans = [p @ directions.T for p in places]
+    low = np.max([s.min(axis=0) for s in spans], axis=0)
+    high = np.min([s.max(axis=0) for s in spans], axis=0)
+    return high - low, (high + low) / 2
+
+
+def topples(contact: PadContact, yaw: float, base: Array, com: Array, friction_table: float) -> Missed | None:
     """Whether a single pad that touches first would tip the part over instead of sliding it.
 
     A push at height h against friction mu tips a part whose support reaches less than ``mu h`` beyond the centre of
@@ -157,7 +248,8 @@ def topples(contact: PadContact, yaw: float, base: Array, com: Array, friction_t
     """
     axis_a, _ = closing_axes(yaw)
     reach = base @ axis_a[:2] - com @ axis_a
-    return bool(min(reach.max(), -reach.min()) < friction_table * contact.z_touch_m)
+    stands, needed = float(min(reach.max(), -reach.min())), friction_table * contact.z_touch_m
+    return Missed(miss=Miss.TIPS, figure=1e3 * stands, limit=1e3 * needed) if stands < needed else None
 
 
 def support_points(mesh: trimesh.Trimesh, T_table_part: Array, tolerance_m: float = 20e-6) -> Array:

@@ -1,234 +1,174 @@
-"""Grasps of a part: found from its mesh for each stable pose, ranked, and stored in ``grasps.json``."""
+"""Grasps of a part: searched on its mesh for each stable pose, tried in physics, ranked and kept in ``grasps.json``.
+
+The file also says of every stable pose what spoke against other grasps, and so why a pose has none.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import sys
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cad import gripper
-from cad.parts import Part, StablePose, hash_file
-from cad.spatial import Array, inverse, transform
-from twin.grasp_geometry import (
-    ContactRules,
-    PadContact,
-    PadStrip,
-    SurfaceSamples,
-    closing_axes,
-    pad_contact,
-    sample_surface,
-    support_points,
-    topples,
-    view_along,
-)
-from twin.robot import TwinError
+from cad.parts import Part, load_part, part_names
+from twin.grasp_config import Grasp, GraspConfig, GraspError, Trial, grasp_from_json
+from twin.grasp_geometry import Miss, sample_surface
+from twin.grasp_search import GraspSearch, find_grasps
+from twin.grasp_trial import TrialBench, TrialConfig
 
-
-class GraspError(TwinError):
-    """A part or stable pose that cannot be gripped, or a grasp file that does not fit its part."""
+_SLIP_M, _SLIP_RAD = 0.1e-3, np.deg2rad(1.0)
+"""A grasp that slips by this in its trial counts 1 / e of one that does not."""
+_MARGIN_TESTS = 4
+_FILE = "grasps.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraspConfig:
-    """How grasps are searched and cleared, in metres and radians."""
+class PoseGrasps:
+    """Grasps of one stable pose, best first, all of which held, and what spoke against others, most frequent first."""
 
-    yaw_step: float = np.deg2rad(5.0)
-    lateral_step_m: float = 0.5e-3
-    lateral_reach_m: float = 4.0e-3
-    distinct_m: float = 0.9e-3
-    tip_clearance_m: float = 0.15e-3
-    sample_spacing_m: float = 0.08e-3
-    clearance_m: float = 3.0e-3
-    min_clearance_m: float = 1.5e-3
-    neighbour_margin_m: float = 0.5e-3
-    keep: int = 24
-    rules: ContactRules = field(default_factory=ContactRules)
-
-    def __post_init__(self) -> None:
-        if not 0 < self.min_clearance_m <= self.clearance_m:
-            raise ValueError(
-                f"opening clearances {self.min_clearance_m} .. {self.clearance_m} m a side must be positive and ordered"
-            )
-        if not 0 < self.tip_clearance_m < gripper.PAD_HEIGHT_M:
-            raise ValueError(
-                f"tip clearance {self.tip_clearance_m} m must lie between 0 and the pad height {gripper.PAD_HEIGHT_M} m"
-            )
+    stable_pose: int
+    grasps: tuple[Grasp, ...]
+    reasons: tuple[str, ...]
 
     @property
-    def strip(self) -> PadStrip:
-        """Where the pads can touch a part on the table."""
-        return PadStrip(
-            half_width_m=gripper.PAD_WIDTH_M / 2,
-            z_low_m=self.tip_clearance_m,
-            z_high_m=self.tip_clearance_m + gripper.PAD_HEIGHT_M,
-        )
+    def why_not(self) -> str:
+        """Why the pose cannot be gripped; empty where it can."""
+        return "" if self.grasps else "; ".join(self.reasons) or "no grasp was found"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Grasp:
-    """One way to take hold of a part that lies in one of its stable poses.
-
-    ``T_part_tcp`` (4, 4) is where the tool is when the pads have closed, ``width_m`` the opening then, ``opening_m``
-    the opening to come down with, ``quality`` in (0, 1], best first.
-    """
-
-    part: str
-    stable_pose: int
-    T_part_tcp: Array
-    width_m: float
-    opening_m: float
-    quality: float
-    contact: PadContact
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain numbers for ``grasps.json``."""
-        return {
-            "stable_pose": self.stable_pose,
-            "T_part_tcp": self.T_part_tcp.round(9).tolist(),
-            "width_m": round(self.width_m, 7),
-            "opening_m": round(self.opening_m, 7),
-            "quality": round(self.quality, 4),
-            "contact": {k: float(f"{v:.4g}") for k, v in asdict(self.contact).items()},
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraspSearch:
-    """Grasps of one stable pose, best first, and how many candidates each reason rejected."""
-
-    grasps: tuple[Grasp, ...]
-    rejections: dict[str, int]
-
-
-def find_grasps(part: Part, stable_pose: StablePose, config: GraspConfig | None = None) -> GraspSearch:
-    """Every parallel-jaw grasp of ``part`` in ``stable_pose`` over yaw and offset along the pads, ranked."""
+def plan_grasps(
+    part: Part, config: GraspConfig | None = None, trial: TrialConfig | None = None
+) -> tuple[PoseGrasps, ...]:
+    """Search the grasps of every stable pose of ``part`` and try them in physics; poses without any say why."""
     config = config or GraspConfig()
-    local = sample_surface(part.mesh, config.sample_spacing_m)
-    R, t = stable_pose.R_table_part, stable_pose.t_table_part
-    samples = SurfaceSamples(points=local.points @ R.T + t, normals=local.normals @ R.T, area_m2=local.area_m2)
-    com = R @ part.mesh.center_mass + t
-    base = support_points(part.mesh, stable_pose.T_table_part)
-    rejections: Counter[str] = Counter()
-    found: list[tuple[float, float, Grasp]] = []
-    for yaw in np.arange(0.0, np.pi - 1e-9, config.yaw_step):
-        view = view_along(samples, yaw, config.strip)
-        for b in _lateral_offsets(com, yaw, config):
-            contact = pad_contact(view, b, config.strip, config.rules)
-            reason = contact if isinstance(contact, str) else _unfit(contact, yaw, base, com, config)
-            if reason:
-                rejections[reason] += 1
-                continue
-            assert isinstance(contact, PadContact)
-            found.append((float(yaw), float(b), _grasp(part, stable_pose, yaw, b, contact, com, config)))
-    found.sort(key=lambda item: -item[2].quality)
-    return GraspSearch(grasps=tuple(_distinct(found, config)[: config.keep]), rejections=dict(rejections))
+    samples = sample_surface(part.mesh, config.sample_spacing_m, config.max_samples)
+    searches = [find_grasps(part, pose, config, samples) for pose in part.stable_poses]
+    if not any(search.grasps for search in searches):
+        return tuple(_judged(k, search, [], []) for k, search in enumerate(searches))
+    bench = TrialBench(part, trial)
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return tuple(pool.map(lambda k: _try_pose(k, searches[k], bench, config), range(len(searches))))
 
 
-def _distinct(found: list[tuple[float, float, Grasp]], config: GraspConfig) -> list[Grasp]:
-    """The best grasp of every yaw, and others of that yaw at least ``distinct_m`` away along the pads."""
-    kept: list[tuple[float, float, Grasp]] = []
-    for yaw, b, grasp in found:
-        if all(yaw != other or abs(b - there) >= config.distinct_m for other, there, _ in kept):
-            kept.append((yaw, b, grasp))
-    return [grasp for _, _, grasp in kept]
+def _try_pose(stable_pose: int, search: GraspSearch, bench: TrialBench, config: GraspConfig) -> PoseGrasps:
+    """Try the candidates of a pose, best first, until enough have held; then see what errors the best ones bear."""
+    held: list[Grasp] = []
+    failed: list[Trial] = []
+    for grasp in search.grasps:
+        trial = bench.run(grasp)
+        if not trial.held:
+            failed.append(trial)
+            continue
+        held.append(replace(grasp, trial=trial, quality=grasp.quality * _steadiness(trial)))
+        if len(held) == config.enough:
+            break
+    for _ in range(_MARGIN_TESTS):
+        held.sort(key=lambda g: -g.quality)
+        if not held or _trial_of(held[0]).margin is not None:
+            break
+        held[0] = _with_margin(held[0], bench.margin(held[0]))
+    return _judged(stable_pose, search, sorted(held, key=lambda g: -g.quality), failed)
 
 
-def _lateral_offsets(com: Array, yaw: float, config: GraspConfig) -> Array:
-    """Offsets along the pads to try: the centre of mass and steps to either side."""
-    steps = int(config.lateral_reach_m / config.lateral_step_m)
-    return com @ closing_axes(yaw)[1] + config.lateral_step_m * np.arange(-steps, steps + 1)
+def _trial_of(grasp: Grasp) -> Trial:
+    assert grasp.trial is not None
+    return grasp.trial
 
 
-def _unfit(contact: PadContact, yaw: float, base: Array, com: Array, config: GraspConfig) -> str | None:
-    if contact.width_m + 2 * config.clearance_m > gripper.STROKE_M:
-        return "wider than the gripper opens"
-    if topples(contact, yaw, base, com, config.rules.friction_table):
-        return "would tip over when pushed"
-    return None
+def _steadiness(trial: Trial) -> float:
+    """Share in (0, 1] by which slip in the hand lowers a grasp's quality."""
+    return float(np.exp(-trial.slip_m / _SLIP_M - trial.slip_rad / _SLIP_RAD))
 
 
-def _grasp(
-    part: Part, stable_pose: StablePose, yaw: float, b: float, contact: PadContact, com: Array, config: GraspConfig
-) -> Grasp:
-    axis_a, axis_b = closing_axes(yaw)
-    R_table_tcp = np.column_stack([axis_a, axis_b, [0.0, 0.0, -1.0]])
-    t_table_tcp = contact.a_mid_m * axis_a + b * axis_b + [0.0, 0.0, config.tip_clearance_m]
-    return Grasp(
-        part=part.name,
-        stable_pose=stable_pose.index,
-        T_part_tcp=inverse(stable_pose.T_table_part) @ transform(R_table_tcp, t_table_tcp),
-        width_m=contact.width_m,
-        opening_m=contact.width_m + 2 * config.clearance_m,
-        quality=_quality(contact, float(com @ axis_b), float(com[2])),
-        contact=contact,
-    )
+def _with_margin(grasp: Grasp, margin: float) -> Grasp:
+    quality = grasp.quality * (0.1 + 0.9 * margin)
+    return replace(grasp, quality=quality, trial=replace(_trial_of(grasp), margin=margin))
 
 
-def _quality(contact: PadContact, com_b: float, com_z: float) -> float:
-    """Product of shares in (0, 1]: self-alignment, contact area, height, closeness to the centre of mass, flatness.
-
-    A face aligns itself with the pad when its length exceeds the width times the pad's friction coefficient.
-    """
-    aligning = min(1.0, contact.length_m / (gripper.PAD_FRICTION * contact.width_m))
-    area = contact.area_m2 / (contact.area_m2 + 1.0e-6)
-    height = min(1.0, contact.height_m / 0.8e-3)
-    lateral = np.exp(-((abs(contact.b_centre_m - com_b) / 1.5e-3) ** 2))
-    vertical = np.exp(-((abs(contact.z_centre_m - com_z) / 3.0e-3) ** 2))
-    flat = np.exp(-((contact.flatness_m / 20e-6) ** 2))
-    return float(aligning * area * height * lateral * vertical * flat)
-
-
-def write_grasps(part: Part, config: GraspConfig | None = None) -> Path:
-    """Search every stable pose of ``part`` and write ``grasps.json`` into its folder.
-
-    Raises GraspError naming the stable poses that cannot be gripped and why.
-    """
-    searches = [find_grasps(part, pose, config) for pose in part.stable_poses]
-    failed = {i: s.rejections for i, s in enumerate(searches) if not s.grasps}
-    path = part.folder / "grasps.json"
-    content = {"made_for": _made_for(part), "grasps": [g.as_json() for s in searches for g in s.grasps]}
-    path.write_text(json.dumps(content) + "\n")
-    read_grasps.cache_clear()
+def _judged(stable_pose: int, search: GraspSearch, held: Sequence[Grasp], failed: Sequence[Trial]) -> PoseGrasps:
+    reasons = []
     if failed:
-        raise GraspError(f"part {part.name!r} cannot be gripped in stable poses {failed}; other grasps are in {path}")
-    return path
+        causes = Counter(trial.why.split(" by ")[0].split(":")[0] for trial in failed)
+        listed = ", ".join(f"{cause} ({n})" for cause, n in causes.most_common())
+        reasons.append(f"{len(held)} of {len(held) + len(failed)} trials in physics held: {listed}")
+    misses = {m: n for m, n in search.rejections.items() if m.miss is not Miss.NOTHING} or search.rejections
+    reasons += [f"{missed} ({n} places)" for missed, n in misses.items()]
+    return PoseGrasps(stable_pose=stable_pose, grasps=tuple(held), reasons=tuple(reasons))
+
+
+def write_grasps(
+    part: Part, config: GraspConfig | None = None, trial: TrialConfig | None = None
+) -> tuple[PoseGrasps, ...]:
+    """Plan the grasps of ``part`` and write ``grasps.json`` into its folder; returns what was found for each pose."""
+    planned = plan_grasps(part, config, trial)
+    content = {
+        "made_for": _made_for(part),
+        "grasps": [grasp.as_json() for pose in planned for grasp in pose.grasps],
+        "reasons": [list(pose.reasons) for pose in planned],
+    }
+    (part.folder / _FILE).write_text(json.dumps(content) + "\n")
+    _read.cache_clear()
+    return planned
 
 
 def _made_for(part: Part) -> dict[str, str]:
-    """Hashes of what grasps depend on."""
-    return {"mesh": part.mesh_hash, "stable_poses": hash_file(part.folder / "stable_poses.json")}
+    """What grasps depend on: the mesh, and how the part lies to a micrometre and ten microradians or so."""
+    poses = np.array([pose.T_table_part for pose in part.stable_poses])
+    rounded = (np.round(poses, 5) + 0.0).tobytes()
+    return {"mesh": part.mesh_hash, "stable_poses": hashlib.sha256(rounded).hexdigest()[:16]}
 
 
-@lru_cache(maxsize=64)
 def read_grasps(part: Part) -> tuple[tuple[Grasp, ...], ...]:
     """Grasps of ``part`` by stable pose, best first, from its folder.
 
     Raises GraspError when there are none or they were made for another mesh or other stable poses.
     """
-    path = part.folder / "grasps.json"
+    return tuple(pose.grasps for pose in describe_grasps(part))
+
+
+def describe_grasps(part: Part) -> tuple[PoseGrasps, ...]:
+    """What is stored about every stable pose: its grasps and what spoke against others. Raises as ``read_grasps``."""
+    path = part.folder / _FILE
     if not path.exists():
-        raise GraspError(f"part {part.name!r} has no grasps.json in {part.folder}; write_grasps makes it")
-    made_for = json.loads(path.read_text()).get("made_for")
-    if made_for != _made_for(part):
+        raise GraspError(f"part {part.name!r} has no {_FILE} in {part.folder}; write_grasps makes it")
+    return _read(part, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _read(part: Part, stamp: int) -> tuple[PoseGrasps, ...]:
+    del stamp
+    path = part.folder / _FILE
+    content: dict[str, Any] = json.loads(path.read_text())
+    if content.get("made_for") != _made_for(part):
         raise GraspError(
-            f"{path} was made for {made_for}, the part's files are {_made_for(part)}; write_grasps makes it anew"
+            f"{path} was made for {content.get('made_for')}, the part's files are {_made_for(part)}; write_grasps "
+            "makes it anew"
         )
-    by_pose: list[list[Grasp]] = [[] for _ in part.stable_poses]
-    for entry in part.grasps:
-        by_pose[entry["stable_pose"]].append(
-            Grasp(
-                part=part.name,
-                stable_pose=entry["stable_pose"],
-                T_part_tcp=np.array(entry["T_part_tcp"]),
-                width_m=entry["width_m"],
-                opening_m=entry["opening_m"],
-                quality=entry["quality"],
-                contact=PadContact(**entry["contact"]),
-            )
+    grasps = [grasp_from_json(part.name, entry) for entry in content["grasps"]]
+    return tuple(
+        PoseGrasps(
+            stable_pose=k, grasps=tuple(g for g in grasps if g.stable_pose == k), reasons=tuple(content["reasons"][k])
         )
-    return tuple(tuple(grasps) for grasps in by_pose)
+        for k in range(len(part.stable_poses))
+    )
+
+
+def main() -> None:
+    """Plan and write the grasps of the parts named on the command line (default: all)."""
+    for name in sys.argv[1:] or part_names():
+        for pose in write_grasps(load_part(name)):
+            best = pose.grasps[0] if pose.grasps else None
+            says = f"{len(pose.grasps)} grasps, the best {1e3 * best.width_m:.2f} mm wide" if best else pose.why_not
+            print(f"{name} face {pose.stable_pose}: {says}")
+
+
+if __name__ == "__main__":
+    main()

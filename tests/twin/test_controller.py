@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from cad.parts import planar
 from cad.spatial import BASLER, Array, apply, inverse, rotation_angle, rotation_x, rotation_z, transform
@@ -13,7 +12,7 @@ from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionE
 from scenes.workcell import CellConfig, build_arm
 from twin.attempts import OUTCOMES, AttemptFinished, AttemptStarted, Calibration, ControllerConfig, Looked
 from twin.controller import ControllerError, PickController
-from twin.grasps import GraspConfig, GraspError, write_grasps
+from twin.grasp_config import GraspError
 from twin.ik import ArmIk
 from twin.robot import GripState, JointMove, LinearMove, MotionRefused, RobotError, RobotState
 
@@ -180,13 +179,6 @@ class World:
         return [[p for p in self.parts if np.allclose(p.T_base_part, T, atol=1e-5)] for T in target]
 
 
-@pytest.fixture
-def brick(make_part):
-    part = make_part(trimesh.creation.box([8e-3, 6e-3, 3e-3]))
-    write_grasps(part, GraspConfig(sample_spacing_m=0.2e-3, yaw_step=np.pi / 6))
-    return part
-
-
 def test_every_part_ends_in_a_nest_of_its_own(brick):
     world = World(brick)
     attempts = world.run()
@@ -307,6 +299,15 @@ def test_the_nearest_turn_of_the_hand_keeps_the_wrist_inside(brick):
         assert world.run()[0].outcome == "placed"
         nest = NESTS[0] @ brick.stable_poses[0].T_table_part
         assert rotation_angle(world.parts[0].T_base_part[:3, :3], nest[:3, :3]) < 1e-6
+
+
+def test_a_pose_that_cannot_be_gripped_is_left_with_the_stored_reason(brick):
+    path = brick.folder / "grasps.json"
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps(stored | {"grasps": [], "reasons": [["wider than the gripper opens: 51.2 mm"]]}))
+    attempts = World(replace(brick)).run()
+    assert [a.outcome for a in attempts] == ["grasp"] * 3 and not any(a.tried for a in attempts)
+    assert all("face 0" in a.note and "51.2 mm" in a.note for a in attempts)
 
 
 def test_what_is_missing_is_named_before_anything_moves(brick):

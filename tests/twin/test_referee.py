@@ -10,7 +10,7 @@ from cad.robot import JOINT_NAMES
 from cad.spatial import rotation_x, transform
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_workcell, set_parts
-from twin.grasps import find_grasps
+from twin.grasp_search import find_grasps
 from twin.referee import Referee
 from twin.robot import RobotError
 from twin.sim_robot import SimRobot
