@@ -15,7 +15,8 @@ import trimesh
 
 from cad.spatial import Array
 
-_STARTS = 240
+_DEGREE = 6
+_STARTS, _TRIALS = 240, 36
 _STEPS = 25
 _LONGEST_STEP = 0.1
 _FLAT = 1e-3  # a gradient this small, relative to the function's range, is none
@@ -31,11 +32,11 @@ def axis_directions(mesh: trimesh.Trimesh, centre: Array) -> Array:
     corners = np.asarray(mesh.triangles) - centre
     corners = corners / np.abs(corners).max()
     volumes = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-    starts = _hemisphere(_STARTS)
+    starts, trials = _hemisphere(_STARTS), _hemisphere(_TRIALS)
+    moments = np.array([_moments(corners @ u, volumes) for u in trials])
     found = [np.linalg.eigh(mesh.moment_inertia)[1].T]
     for degree in (4, 6):
-        values = np.array([_moment(corners @ u, volumes, degree) for u in _hemisphere(64)])
-        found.append(_Polynomial(degree, _hemisphere(64), values).critical_directions(starts))
+        found.append(_Polynomial(degree, trials, moments[:, degree]).critical_directions(starts))
     kept: list[Array] = []
     for u in np.concatenate(found):
         if all(abs(float(u @ other)) < _SAME for other in kept):
@@ -92,20 +93,20 @@ class _Polynomial:
         return (x * y * z).T
 
 
-def _moment(heights: Array, volumes: Array, degree: int) -> float:
-    """Integral of height ** degree over tetrahedra from the origin with corner heights (N, 3) and volumes (N,).
+def _moments(heights: Array, volumes: Array) -> Array:
+    """Integrals of height ** k, k = 0 to 6, over tetrahedra from the origin with corner heights (N, 3), volumes (N,).
 
     Over a simplex it is the complete homogeneous symmetric polynomial of the heights times a constant (Lasserre and
-    Avrachenkov, American Mathematical Monthly, 2001); the origin's height is zero. The constant is left out.
+    Avrachenkov, American Mathematical Monthly, 2001); the origin's height is zero. The constants are left out.
     """
-    a, b, c = heights.T
-    rows = [np.ones_like(a)]
-    for k in range(1, degree + 1):  # of a alone
-        rows.append(rows[-1] * a)
+    a, b, c = np.ascontiguousarray(heights.T)
+    powers = [np.ones_like(a)]
+    for _ in range(_DEGREE):
+        powers.append(powers[-1] * a)
     for other in (b, c):
-        for k in range(1, degree + 1):
-            rows[k] = rows[k] + other * rows[k - 1]
-    return float(rows[degree] @ volumes)
+        for k in range(1, _DEGREE + 1):
+            powers[k] = powers[k] + other * powers[k - 1]
+    return np.array([p @ volumes for p in powers])
 
 
 def _hemisphere(count: int) -> Array:

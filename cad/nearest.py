@@ -14,6 +14,7 @@ from cad.spatial import Array
 
 _SAMPLES = 40_000
 _TRIAL = 2000
+_NEIGHBOURS = 8
 _EXACT, _MANY = 32, 1024  # points measured exactly at a time, first and later, those with the largest bounds first
 
 
@@ -37,19 +38,24 @@ class Surface:
         return self._scale * np.asarray(trimesh.proximity.closest_point(self._mesh, self._local(points))[1])
 
     def nearest(self, points: Array) -> tuple[Array, Array]:
-        """Points on the triangles of the nearest samples, hardly ever not the nearest, and normals there: (N, 3) both."""
+        """The surface's points nearest to points (N, 3), as far as single samples tell, and normals: (N, 3) both."""
         local = self._local(points)
         index = self._triangle[self._tree.query(local)[1]]
         on_surface = trimesh.triangles.closest_point(np.asarray(self._mesh.triangles)[index], local)
         return self._origin + self._scale * on_surface, np.asarray(self._mesh.face_normals)[index]
 
-    def upper_bounds(self, points: Array) -> Array:
-        """(N,) distances of points (N, 3) from what ``nearest`` finds: never below the exact, hardly ever above."""
-        return np.linalg.norm(self.nearest(points)[0] - points, axis=1)
+    def upper_bounds(self, points: Array, samples: int = 1) -> Array:
+        """(N,) distances of points (N, 3) from the triangles of that many nearest samples: never below the exact."""
+        local = self._local(points)
+        index = self._triangle[self._tree.query(local, k=samples)[1]].reshape(len(points), samples)
+        repeated = np.repeat(local, samples, axis=0)
+        found = trimesh.triangles.closest_point(np.asarray(self._mesh.triangles)[index.ravel()], repeated)
+        return self._scale * np.linalg.norm(found - repeated, axis=1).reshape(index.shape).min(axis=1)
 
     def all_within(self, points: Array, limit: float) -> bool:
         """Whether no point of (N, 3) is farther from the surface than ``limit``."""
-        bounds = self.upper_bounds(points)
+        points = points[self.upper_bounds(points) > limit]
+        bounds = self.upper_bounds(points, _NEIGHBOURS) if len(points) else np.empty(0)
         doubtful = np.flatnonzero(bounds > limit)
         doubtful = doubtful[np.argsort(-bounds[doubtful])]
         groups = np.split(doubtful, np.arange(_EXACT, len(doubtful), _MANY))
@@ -57,7 +63,7 @@ class Surface:
 
     def largest(self, points: Array) -> float:
         """Largest distance of points (N, 3) from the surface."""
-        bounds = self.upper_bounds(points)
+        bounds = self.upper_bounds(points, _NEIGHBOURS)
         order = np.argsort(-bounds)
         largest = 0.0
         for start in range(0, len(order), _MANY):

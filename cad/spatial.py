@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -93,6 +94,12 @@ def yaw_of(R: Array) -> float:
 def wrap_angle(angle: ArrayLike) -> Array:
     """Angle(s) in rad wrapped to [-pi, pi)."""
     return (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+
+
+def diameter(points: ArrayLike) -> float:
+    """Largest distance between two of points (N, 3)."""
+    p = np.asarray(points, dtype=np.float64)
+    return float(max(cdist(p[i : i + 256], p).max() for i in range(0, len(p), 256)))
 
 
 @dataclass(frozen=True, kw_only=True)

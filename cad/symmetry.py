@@ -18,7 +18,7 @@ from cad.equivalence import Axis, Symmetries, symmetries_to_json
 from cad.meshes import surface_samples
 from cad.moments import axis_directions
 from cad.nearest import Surface
-from cad.spatial import Array, rotation_from_rotvec, rotvec_from_rotation, transform
+from cad.spatial import Array, diameter, rotation_from_rotvec, rotvec_from_rotation, transform
 
 RELATIVE_TOLERANCE = 0.003
 TOLERANCE_BOUNDS_M = (5e-6, 30e-6)
@@ -30,14 +30,15 @@ moves its surface by as much: hence 5 um.
 """
 MAX_ORDER = 60
 _PRIMES = tuple(p for p in range(2, MAX_ORDER) if all(p % k for k in range(2, p)))
-_ODD_ANGLES_RAD = (0.41, 1.0, 1.73, 2.6)  # shared by no finite turn: what passes them is continuous
+_ODD_ANGLES_RAD = (0.41, -1.0, 1.73, -2.6)  # shared by no finite turn: what passes them is continuous
 _SAME_RAD = np.radians(2.0)
 _STEP_RAD = np.radians(0.5)
 _POLYHEDRAL = 5  # turns of a higher order have one axis
-_QUICK, _SOME, _SAMPLES, _MOST_CORNERS = 96, 500, 4000, 20_000
+_QUICK, _SOME, _SAMPLES, _MOST_CORNERS = 64, 500, 4000, 8000
 _REFINEMENTS = 4
 _KEPT = 0.8  # of the points: the others are near edges, where the face found may be the wrong one
 _WEAK = 1e-6
+_TRIES = 4
 _LARGEST_GROUP = 2 * MAX_ORDER
 
 
@@ -47,7 +48,7 @@ def find_symmetries(mesh: trimesh.Trimesh, tolerance_m: float | None = None) -> 
     The default is ``default_tolerance_m``. Turns of up to 60 a circle are told from round; a ball has two axes, which
     generate every rotation. Raises ValueError for a tolerance that is not positive.
     """
-    tolerance_m = default_tolerance_m(diameter(mesh)) if tolerance_m is None else float(tolerance_m)
+    tolerance_m = default_tolerance_m(_diameter(mesh)) if tolerance_m is None else float(tolerance_m)
     if not tolerance_m > 0:
         raise ValueError(f"tolerance {tolerance_m} m: it must be positive")
     solid = _Solid(mesh, tolerance_m)
@@ -79,18 +80,12 @@ def default_tolerance_m(diameter_m: float) -> float:
 def models_info(mesh: trimesh.Trimesh, symmetries: Symmetries) -> dict[str, Any]:
     """The part's entry of a BOP ``models_info.json`` in millimetres; ``symmetry_tolerance`` is ours."""
     low, high = 1e3 * mesh.bounds
-    info: dict[str, Any] = {"diameter": round(1e3 * diameter(mesh), 6)}
+    info: dict[str, Any] = {"diameter": round(1e3 * _diameter(mesh), 6)}
     info |= {f"min_{a}": round(float(v), 6) for a, v in zip("xyz", low, strict=True)}
     info |= {f"size_{a}": round(float(v), 6) for a, v in zip("xyz", high - low, strict=True)}
     info |= symmetries_to_json(symmetries)
     info["symmetry_tolerance"] = round(1e3 * symmetries.tolerance_m, 9)
     return info
-
-
-def diameter(mesh: trimesh.Trimesh) -> float:
-    """Largest distance in metres between two points of the mesh."""
-    v = np.asarray(mesh.convex_hull.vertices)
-    return float(max(np.linalg.norm(v - p, axis=1).max() for p in v))
 
 
 class _Solid:
@@ -101,11 +96,10 @@ class _Solid:
         self.centre = np.array(mesh.center_mass)
         centred = trimesh.Trimesh(mesh.vertices - self.centre, mesh.faces, process=False)
         rng = np.random.default_rng(0)
-        corners = np.asarray(centred.vertices)
-        if len(corners) > _MOST_CORNERS:
-            corners = rng.choice(corners, _MOST_CORNERS, replace=False)
+        corners = _sharpest(centred, _MOST_CORNERS)
         self.points = np.concatenate([surface_samples(centred, _SAMPLES, rng)[0], corners])
-        self.few, self.some = rng.choice(self.points, _QUICK), rng.choice(self.points, _SOME)
+        self.some = rng.choice(self.points, _SOME)
+        self.few = np.concatenate([self.some[:_QUICK], rng.choice(corners[:_SOME], _QUICK)])
         self.surface = Surface(centred)
         self.slack_m = 2 * float(np.sin(_STEP_RAD) * np.linalg.norm(corners, axis=1).max())
 
@@ -123,6 +117,7 @@ class _Solid:
 
     def refined(self, R: Array) -> Array:
         """The rotation next to ``R`` that lays the solid on itself best: distances along normals, least squares."""
+        start = R
         for _ in range(_REFINEMENTS):
             turned = self.some @ R.T
             found, normals = self.surface.nearest(turned)
@@ -130,37 +125,37 @@ class _Solid:
             kept = np.argsort(np.linalg.norm(found - turned, axis=1))[: round(_KEPT * len(turned))]
             step = np.linalg.lstsq(np.cross(turned, normals)[kept], distances[kept], rcond=_WEAK)[0]
             R = rotation_from_rotvec(step) @ R
-        return R
+        return R if _is_among(R, start[None]) else start
 
     def round_axes(self, directions: Array) -> list[Array]:
         """The axis about which every turn leaves the surface in place; two of them when every rotation does."""
         for direction in directions:
             if not all(self.may_pass(_turn(direction, angle), self.slack_m) for angle in _ODD_ANGLES_RAD):
                 continue
-            axis = _axis(self.refined(_turn(direction, _ODD_ANGLES_RAD[-1])))
+            axis = _axis(self.refined(_turn(direction, _ODD_ANGLES_RAD[2])))
             if self._is_round(axis):
                 other = _across(axis)
                 return [axis, other] if self._is_round(other) else [axis]
         return []
 
     def _is_round(self, axis: Array) -> bool:
-        return all(self.passes(_turn(axis, sign * angle)) for angle in _ODD_ANGLES_RAD for sign in (1, -1))
+        return all(self.passes(_turn(axis, angle)) for angle in _ODD_ANGLES_RAD)
 
     def flip(self, axis: Array, order: int | None) -> list[Array]:
         """A half-turn about an axis across ``axis`` if there is one; ``order`` is None when the solid is round."""
         count = max(1, round(np.pi / order / _STEP_RAD)) if order else 1
         x = _across(axis)
         y = np.cross(axis, x)
-        best, least = None, np.inf
+        found: list[tuple[float, Array]] = []
         for angle in np.pi / (order or 1) * np.arange(count) / count:
             R = _turn(np.cos(angle) * x + np.sin(angle) * y, np.pi)
             if self.may_pass(R, self.slack_m):
-                mean = float(self.surface.upper_bounds(self.few @ R.T).mean())
-                best, least = (R, mean) if mean < least else (best, least)
-        if best is None:
-            return []
-        R = _turn(_axis(self.refined(best)), np.pi)
-        return [R] if self.passes(R) else []
+                found.append((float(self.surface.upper_bounds(self.some @ R.T).mean()), R))
+        for _, R in sorted(found, key=lambda item: item[0])[:_TRIES]:
+            R = _turn(_axis(self.refined(R)), np.pi)
+            if self.passes(R):
+                return [R]
+        return []
 
     def order(self, direction: Array) -> tuple[int, Array]:
         """The largest order of a turn about an axis near ``direction`` that is a symmetry, 1 when none is; the axis."""
@@ -199,7 +194,7 @@ class _Solid:
 
 
 def _closure(group: Array, generator: Array) -> Array:
-    """The group (N, 3, 3), made exact, that ``generator`` (3, 3) and a group generate; that group if it is too large."""
+    """The exact group (N, 3, 3) that a group and ``generator`` (3, 3) generate; the group itself if too large."""
     generators, larger = [*group[1:], generator], group
     queue = [generator]
     while queue:
@@ -228,6 +223,17 @@ def _exact(group: Array) -> Array:
 def _is_among(R: Array, group: Array) -> bool:
     """Whether a rotation (3, 3) is nearly one of ``group`` (N, 3, 3)."""
     return bool((np.einsum("nab,ab->n", group, R) > 1 + 2 * np.cos(_SAME_RAD)).any())
+
+
+def _diameter(mesh: trimesh.Trimesh) -> float:
+    return diameter(mesh.convex_hull.vertices)
+
+
+def _sharpest(mesh: trimesh.Trimesh, count: int) -> Array:
+    """Up to ``count`` vertices (N, 3), those of the sharpest edges first."""
+    sharpness = np.zeros(len(mesh.vertices))
+    np.maximum.at(sharpness, mesh.face_adjacency_edges, mesh.face_adjacency_angles[:, None])
+    return np.asarray(mesh.vertices)[np.argsort(-sharpness, kind="stable")[:count]]
 
 
 def _turn(axis: Array, angle: float) -> Array:
