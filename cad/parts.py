@@ -57,6 +57,7 @@ class StablePose:
     part's origin when the centre of its bounding rectangle seen from above is at the table frame's origin, so that a
     part at rest is ``T_board_part = planar(x, y, yaw) @ T_table_part``. A part whose hull is round about a level axis
     rests at any turn about it: ``roll`` is that axis in the part's frame, and this one pose stands for all of them.
+    ``view_equivalents`` are other placements that look like it at yaw 0; None while they have not been computed.
     """
 
     index: int
@@ -65,7 +66,7 @@ class StablePose:
     probability: float
     view_class: int
     roll: Axis | None = None
-    view_equivalents: tuple[ViewEquivalent, ...] = ()
+    view_equivalents: tuple[ViewEquivalent, ...] | None = None
 
     @property
     def T_table_part(self) -> Array:
@@ -233,14 +234,18 @@ def _read_stable_poses(path: Path) -> tuple[StablePose, ...]:
             probability=float(p["probability"]),
             view_class=int(p.get("view_class", i)),
             roll=axis_from_json(p["roll"]) if p.get("roll") else None,
-            view_equivalents=tuple(
-                ViewEquivalent(
-                    stable_pose=int(e["stable_pose"]),
-                    yaw=float(e["yaw_rad"]),
-                    shift_m=(float(e["shift_m"][0]), float(e["shift_m"][1])),
-                )
-                for e in p.get("view_equivalents", ())
-            ),
+            view_equivalents=_view_equivalents(p["view_equivalents"]) if "view_equivalents" in p else None,
         )
         for i, p in enumerate(json.loads(path.read_text())["stable_poses"])
+    )
+
+
+def _view_equivalents(entries: list[dict[str, Any]]) -> tuple[ViewEquivalent, ...]:
+    return tuple(
+        ViewEquivalent(
+            stable_pose=int(e["stable_pose"]),
+            yaw=float(e["yaw_rad"]),
+            shift_m=(float(e["shift_m"][0]), float(e["shift_m"][1])),
+        )
+        for e in entries
     )
