@@ -29,10 +29,11 @@ class SimHand:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
         joints = [model.joint(name) for name in FINGER_JOINTS]
-        self._qpos = np.array([j.qposadr[0] for j in joints])
+        self._left, self._right = (int(j.qposadr[0]) for j in joints)
         self._dofs = np.array([j.dofadr[0] for j in joints])
-        self._bodies = np.array([j.bodyid[0] for j in joints])
-        self._signs = np.array([model.jnt_axis[j.id][0] for j in joints])
+        self._opens = np.zeros(model.nbody)
+        for joint in joints:  # the x direction in which a finger opens; 0 for every other body
+            self._opens[joint.bodyid[0]] = model.jnt_axis[joint.id][0]
         self._actuator = model.actuator(GRIPPER_ACTUATOR).id
         self._inputs = hand_inputs(model)
         self._target = self._set_point = self.opening_m
@@ -42,7 +43,7 @@ class SimHand:
     @property
     def opening_m(self) -> float:
         """Opening between the pads."""
-        return float(self._data.qpos[self._qpos].sum())
+        return float(self._data.qpos[self._left] + self._data.qpos[self._right])
 
     @property
     def speed(self) -> float:
@@ -52,7 +53,8 @@ class SimHand:
     @property
     def at_rest(self) -> bool:
         """Whether the fingers have stopped: where they were sent, or stalled on the way."""
-        return self.speed < REST_SPEED and (self._stalled or self._set_point == self._target)
+        arrived = abs(self._target - self._set_point) < 1e-9
+        return self.speed < REST_SPEED and (arrived or self._stalled)
 
     @property
     def state(self) -> GripState:
@@ -94,10 +96,8 @@ class SimHand:
             if self._lag < -REACH_M:  # what held the fingers has gone
                 self._set_point = self.opening_m
             left = self._target - self._set_point
-            velocity = float(np.clip(left / period_s, -self._speed, self._speed))
-            self._set_point = (
-                self._target if abs(left) <= self._speed * period_s else self._set_point + velocity * period_s
-            )
+            velocity = max(-self._speed, min(self._speed, left / period_s))
+            self._set_point += velocity * period_s
         self._data.ctrl[self._inputs] = self._set_point, velocity, push
 
     def stop(self) -> None:
@@ -125,13 +125,10 @@ class SimHand:
     @property
     def _contact_force(self) -> float:
         """Force (N) with which contacts push the fingers open, both fingers' added; negative pushes them together."""
-        total, wrench = 0.0, np.zeros(6)
-        for i, contact in enumerate(self._data.contact):
-            for geom, direction in ((contact.geom1, -1.0), (contact.geom2, 1.0)):
-                finger = np.nonzero(self._bodies == self._model.geom_bodyid[geom])[0]
-                if len(finger):
-                    mujoco.mj_contactForce(self._model, self._data, i, wrench)
-                    force = direction * contact.frame.reshape(3, 3).T @ wrench[:3]
-                    axis = self._data.xmat[self._bodies[finger[0]]].reshape(3, 3)[:, 0] * self._signs[finger[0]]
-                    total += float(axis @ force)
+        total, wrench, bodies = 0.0, np.zeros(6), self._model.geom_bodyid[self._data.contact.geom]
+        for i, side in zip(*np.nonzero(self._opens[bodies]), strict=True):
+            finger = bodies[i, side]
+            mujoco.mj_contactForce(self._model, self._data, int(i), wrench)
+            force = (1.0 if side else -1.0) * self._data.contact.frame[i].reshape(3, 3).T @ wrench[:3]
+            total += float(self._opens[finger] * self._data.xmat[finger].reshape(3, 3)[:, 0] @ force)
         return total
