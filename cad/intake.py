@@ -74,7 +74,7 @@ def read_part(
     config = config or IntakeConfig()
     if unit is not None and unit not in METRES_PER_UNIT:
         raise MeshError(f"unit {unit!r} is unknown; use one of {', '.join(METRES_PER_UNIT)}")
-    data, name = read_bytes(path), path.name
+    data, name = read_bytes(path), str(path)
     if path.suffix.lower() in CAD_SUFFIXES:
         declared = declared_unit(data)
         soups = read_step(data, name, time_limit_s=config.time_limit_s)
@@ -133,10 +133,14 @@ def _check_size(name: str, soups: list[Soup], unit: str, accept: bool, config: I
     if accept or low <= size <= high:
         return
     others = {other: size * factor / METRES_PER_UNIT.get(unit, 1e-3) for other, factor in METRES_PER_UNIT.items()}
-    listed = ", ".join(f"{value:.3g} mm if they are {other}" for other, value in others.items() if other != unit)
+    listed = ", ".join(f"{_mm(value)} if they are {key}" for key, value in others.items() if key not in (unit, "ft"))
     fitting = [other for other, value in others.items() if low <= value <= high and other != unit]
     hint = f"--unit {fitting[0]}" if len(fitting) == 1 else f"--unit {'|'.join(METRES_PER_UNIT)}"
     raise MeshError(
-        f"{name} is {size:.3g} mm long if its numbers are {unit}, but this cell picks parts of {low:g} to {high:g} mm; "
-        f"which unit is it ({listed})? Answer with {hint}, or with --accept-size if {size:.3g} mm is right"
+        f"{name} is {_mm(size)} long if its numbers are {unit}, but this cell picks parts of {low:g} to {high:g} mm; "
+        f"which unit is it ({listed})? Answer with {hint}, or with --accept-size if {_mm(size)} is right"
     )
+
+
+def _mm(value: float) -> str:
+    return f"{value:,.0f} mm" if value >= 1000 else f"{value:.3g} mm"

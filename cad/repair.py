@@ -14,9 +14,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from cad.soup import Ints, Mask, Soup, distinct_corners, orient
+from cad.soup import Ints, Soup, distinct_corners, orient
 from cad.spatial import Array
 
+_MOST_WALLS = 64
 _PARALLEL = 1e-6  # 1 - |cosine| between the normals of holes in one plane
 
 
@@ -47,18 +48,22 @@ def drop_copies(soup: Soup) -> tuple[Soup, int]:
     keep[first] = True
     multiple = first[(counts > 1)]
     even = keep & (counts[index.reshape(-1)] % 2 == 0)
+    sides = soup.edges.index.reshape(-1, 3)
+    counts = np.bincount(sides[keep].reshape(-1), minlength=len(soup.edges.counts))
     for patch in _patches(soup, multiple):
-        without = keep.copy()
-        without[patch[even[patch]]] = False
-        if _odd_sides(soup, without) < _odd_sides(soup, keep):
-            keep = without
+        pairs = patch[even[patch]]
+        touched, removed = np.unique(sides[pairs], return_counts=True)
+        if ((counts[touched] - removed) % 2).sum() < (counts[touched] % 2).sum():
+            keep[pairs] = False
     return soup.take(keep), int((~keep).sum())
 
 
 def drop_walls(soup: Soup) -> tuple[Soup, int]:
     """Without inner walls between compartments (three surfaces meet along the wall's rim), and how many there were."""
-    walls = 0
+    given, walls = soup, 0
     while (soup.edges.counts[open_edges(soup)] > 1).any():
+        if walls == _MOST_WALLS:
+            return given, 0  # these are no walls
         edges, (_, patch, _) = soup.edges, orient(soup)
         rim = edges.counts[edges.index] != 2
         sound = rim & (edges.counts[edges.index] % 2 == 1) & (edges.counts[edges.index] > 1)
@@ -113,7 +118,7 @@ def split_t_junctions(soup: Soup, gap: float) -> tuple[Soup, int]:
     touched = np.isin(sides, list(inserted)).any(axis=1)
     faces = [face for f in np.flatnonzero(touched) for face in _split(soup, int(f), inserted)]
     stacked = np.concatenate([soup.faces[~touched], np.array(faces, dtype=np.int64)])
-    return Soup(vertices=soup.vertices, faces=stacked), len(point)
+    return Soup(vertices=soup.vertices, faces=stacked).take(distinct_corners(stacked)), len(point)
 
 
 def fill_holes(soup: Soup, flat: float) -> tuple[Soup, list[Hole]]:
@@ -124,23 +129,23 @@ def fill_holes(soup: Soup, flat: float) -> tuple[Soup, list[Hole]]:
     loops = _loops(soup.edges.ends[open_edges(soup)])
     if not loops:
         return soup, []
-    groups: list[list[tuple[Ints, Array, Array]]] = []
-    holes, faces = [], [soup.faces]
-    for loop in loops:
+    planes = [_plane(soup.vertices[loop]) for loop in loops]
+    centres, normals = (np.array(values) for values in zip(*planes, strict=True))
+    holes, unevenness = [], np.empty(len(loops))
+    for i, loop in enumerate(loops):
         points = soup.vertices[loop]
-        centre, normal = _plane(points)
-        unevenness = float(np.abs((points - centre) @ normal).max())
-        holes.append(Hole(width=float(np.linalg.norm(np.ptp(points, axis=0))), unevenness=unevenness))
-        entry = (loop, centre, normal)
-        home = None
-        if unevenness <= flat:
-            home = next((g for g in groups if _same_plane(g[0], entry, flat)), None)
-        if home is None:
-            groups.append([entry])
-        else:
-            home.append(entry)
-    for group in groups:
-        faces.append(_fill(soup.vertices, [loop for loop, _, _ in group], group[0][1], group[0][2]))
+        unevenness[i] = np.abs((points - centres[i]) @ normals[i]).max()
+        holes.append(Hole(width=float(np.linalg.norm(np.ptp(points, axis=0))), unevenness=float(unevenness[i])))
+    faces, left = [soup.faces], np.ones(len(loops), bool)
+    for i in range(len(loops)):
+        if not left[i]:
+            continue
+        group = left & (np.arange(len(loops)) == i)
+        if unevenness[i] <= flat:
+            offset = np.abs((centres - centres[i]) @ normals[i])
+            group |= left & (unevenness <= flat) & (1 - np.abs(normals @ normals[i]) < _PARALLEL) & (offset <= flat)
+        left &= ~group
+        faces.append(_fill(soup.vertices, [loops[j] for j in np.flatnonzero(group)], centres[i], normals[i]))
     return Soup(vertices=soup.vertices, faces=np.concatenate(faces)), holes
 
 
@@ -151,11 +156,6 @@ def _patches(soup: Soup, faces: Ints) -> list[Ints]:
     links = coo_matrix((np.ones(len(sides), bool), (owner, sides)), (len(faces), len(soup.edges.counts))).tocsr()
     label = connected_components(links @ links.T, directed=False)[1]
     return [faces[label == i] for i in range(label.max(initial=-1) + 1)]
-
-
-def _odd_sides(soup: Soup, keep: Mask) -> int:
-    counts = np.bincount(soup.edges.index.reshape(-1, 3)[keep].reshape(-1), minlength=len(soup.edges.counts))
-    return int((counts % 2).sum())
 
 
 def _split(soup: Soup, face: int, inserted: dict[int, Ints]) -> list[tuple[int, int, int]]:
@@ -217,10 +217,6 @@ def _plane(points: Array) -> tuple[Array, Array]:
     if np.linalg.norm(normal) < 1e-9 * (around**2).sum():  # a slit
         normal = np.linalg.svd(around)[2][2]
     return centre, normal / np.linalg.norm(normal)
-
-
-def _same_plane(a: tuple[Ints, Array, Array], b: tuple[Ints, Array, Array], flat: float) -> bool:
-    return bool(1 - abs(a[2] @ b[2]) < _PARALLEL and abs((b[1] - a[1]) @ a[2]) <= flat)
 
 
 def _fill(vertices: Array, loops: list[Ints], centre: Array, normal: Array) -> Ints:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cad.soup import Ints, Soup, orient
+from cad.soup import Ints, Soup, distinct_corners, orient
 from cad.spatial import Array
 
 _RAYS = np.array(
@@ -31,7 +31,7 @@ def shells_of(soup: Soup) -> list[Soup] | None:
     given = soup if soup.volume > 0 else soup.flipped()
     for candidate in (given, oriented_by_parity(oriented, patch)):
         cut = cut_apart(candidate)
-        if cut is not None:
+        if cut is not None and cut.is_closed and distinct_corners(cut.faces).all():
             return cut.components()
     return None
 
@@ -79,9 +79,9 @@ def cut_apart(soup: Soup) -> Soup | None:
     return Soup(vertices=soup.vertices[soup.faces.reshape(-1)[first]], faces=label.reshape(-1, 3).astype(np.int64))
 
 
-def inside(soup: Soup, points: Array) -> Array:
-    """(N,) whether points (N, 3) lie inside a closed shell."""
-    return np.array([_mostly_inside(soup, point, _RAYS) for point in points], dtype=bool)
+def all_inside(soup: Soup, points: Array) -> bool:
+    """Whether all points (N, 3) lie inside a closed shell."""
+    return all(_mostly_inside(soup, point, _RAYS[:3]) for point in points)
 
 
 def _pairs_around(soup: Soup, edge: int, sides: Ints) -> Ints | None:

@@ -12,15 +12,14 @@ from cad.meshes import MeshError
 from cad.soup import Soup
 
 
+def bounds_solid(shell: Soup) -> bool:
+    """Whether a shell bounds a solid."""
+    return _solid(shell).status() == Error.NoError
+
+
 def to_solid(shell: Soup) -> Manifold:
     """The solid that a closed, consistently wound shell bounds, whichever way its normals point."""
-    outward = shell if shell.volume > 0 else shell.flipped()
-    solid = Manifold(
-        Mesh64(
-            vert_properties=np.ascontiguousarray(outward.vertices, dtype=np.float64),
-            tri_verts=np.ascontiguousarray(outward.faces, dtype=np.uint64),
-        )
-    )
+    solid = _solid(shell if shell.volume > 0 else shell.flipped())
     if solid.status() != Error.NoError:
         raise MeshError(f"a shell of {len(shell.faces)} triangles bounds no solid ({solid.status().name})")
     return solid
@@ -42,4 +41,13 @@ def to_mesh(solid: Manifold) -> trimesh.Trimesh:
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(
         np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64), process=False
+    )
+
+
+def _solid(shell: Soup) -> Manifold:
+    return Manifold(
+        Mesh64(
+            vert_properties=np.ascontiguousarray(shell.vertices, dtype=np.float64),
+            tri_verts=np.ascontiguousarray(shell.faces, dtype=np.uint64),
+        )
     )

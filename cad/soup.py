@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -54,13 +55,32 @@ class Soup:
         turn = np.broadcast_to(mask, len(self.faces))
         return Soup(vertices=self.vertices, faces=np.where(turn[:, None], self.faces[:, ::-1], self.faces))
 
-    def components(self) -> list[Soup]:
-        """The parts that hang together along edges, in the order of their first triangles."""
+    def pieces(self) -> Ints:
+        """(F,) number of the piece that each triangle belongs to; a piece hangs together along edges."""
         edges = self.edges
         owner = np.arange(3 * len(self.faces)) // 3
         links = coo_matrix((np.ones(len(owner), bool), (owner, edges.index)), (len(self.faces), len(edges.counts)))
-        count, label = connected_components(links @ links.T, directed=False)
-        return [self] if count == 1 else [self.take(label == i) for i in range(count)]
+        return connected_components(links @ links.T, directed=False)[1].astype(np.int64)
+
+    def components(self) -> list[Soup]:
+        """The pieces one by one, in the order of their first triangles."""
+        piece = self.pieces()
+        if not piece.any():
+            return [self] if len(piece) else []
+        order = np.argsort(piece, kind="stable")
+        return [self.take(faces) for faces in np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)]
+
+
+def soups_of(scene: trimesh.Scene) -> list[Soup]:
+    """The triangles of every mesh in a scene, where the scene places it."""
+    soups = []
+    for node in scene.graph.nodes_geometry:
+        pose, key = scene.graph[node]
+        mesh = scene.geometry[key]
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            vertices = trimesh.transform_points(np.asarray(mesh.vertices, dtype=np.float64), pose)
+            soups.append(Soup(vertices=vertices, faces=np.array(mesh.faces, dtype=np.int64)))
+    return soups
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,17 +12,17 @@ import sys
 from io import BytesIO
 from pathlib import Path
 
-import numpy as np
 import trimesh
 
 from cad.meshes import ANGULAR_DEFLECTION_RAD, DEFLECTION_MM, MeshError
-from cad.soup import Soup
+from cad.soup import Soup, soups_of
 
 _BEGIN, _END = b"ISO-10303-21", b"END-ISO-10303-21"  # ISO 10303-21, 5.1: first and last token of a file
 _PREFIXES = {"$": "m", ".MILLI.": "mm", ".CENTI.": "cm", ".MICRO.": "um"}
 _CONVERTED = {"INCH": "in", "FOOT": "ft"}
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _TIME_LIMIT_S = 120.0
+_WORKER = Path(__file__).with_name("step_worker.py")
 
 
 def read_step(data: bytes, name: str, *, time_limit_s: float = _TIME_LIMIT_S) -> list[Soup]:
@@ -35,8 +35,7 @@ def read_step(data: bytes, name: str, *, time_limit_s: float = _TIME_LIMIT_S) ->
         raise MeshError(f"{name} is not a STEP file (it does not begin with {_BEGIN.decode()}); export the part again")
     if _END not in data[-4096:]:
         raise MeshError(f"{name} is cut short (it does not end with {_END.decode()}); copy or export it again")
-    worker = Path(__file__).with_name("step_worker.py")
-    command = [sys.executable, "-P", str(worker), str(DEFLECTION_MM), str(ANGULAR_DEFLECTION_RAD)]
+    command = [sys.executable, "-P", str(_WORKER), str(DEFLECTION_MM), str(ANGULAR_DEFLECTION_RAD)]
     try:
         done = subprocess.run(command, input=data, capture_output=True, timeout=time_limit_s, check=False)
     except subprocess.TimeoutExpired as error:
@@ -47,14 +46,7 @@ def read_step(data: bytes, name: str, *, time_limit_s: float = _TIME_LIMIT_S) ->
         raise MeshError(f"{name} crashed the CAD kernel (signal {-done.returncode}); export it again, or as STL")
     if done.returncode:
         raise MeshError(f"{name} cannot be read as STEP{_reason(done.stderr)}; export it again, or as STL")
-    scene = trimesh.load_scene(BytesIO(done.stdout), file_type="glb", process=False)
-    soups = []
-    for node in scene.graph.nodes_geometry:
-        pose, key = scene.graph[node]
-        shape = scene.geometry[key]
-        if isinstance(shape, trimesh.Trimesh):
-            vertices = trimesh.transform_points(np.asarray(shape.vertices, dtype=np.float64), pose)
-            soups.append(Soup(vertices=vertices, faces=np.asarray(shape.faces, dtype=np.int64)))
+    soups = soups_of(trimesh.load_scene(BytesIO(done.stdout), file_type="glb", process=False))
     if not soups:
         raise MeshError(f"{name} holds no solid and no surface (a drawing or a wire frame?); export the solid part")
     return soups

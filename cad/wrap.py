@@ -2,8 +2,8 @@
 
 After Nooruddin and Turk 2003, "Simplification and repair of polygonal models using volumetric techniques": along each
 axis the parity of the surfaces crossed says what is inside, columns that enter more often than they leave do not vote,
-and the majority of the axes decides. The surface between inside and outside is found by marching tetrahedra and drawn
-onto the triangles nearby.
+and the votes, spread between the cells that the surface leaves free, decide by majority. The surface between inside and
+outside is found by marching tetrahedra and drawn onto the triangles nearby.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from itertools import pairwise, permutations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
@@ -21,6 +22,7 @@ from cad.spatial import Array
 _MARGIN = 3  # cells around the surface
 _OFF_CENTRE = 0.017  # of a cell, so that lines do not run along edges
 _SMOOTHING = 0.6  # cells
+_SPREADING = 40  # steps of a cell, for votes that holes led astray
 _CHUNK = 4_000_000
 
 
@@ -33,7 +35,7 @@ def wrap(soup: Soup, cells: int) -> Soup | None:
     cell = float((high - low).max()) / cells
     origin = low - (_MARGIN + _OFF_CENTRE) * cell
     shape = np.ceil((high - origin) / cell).astype(int) + _MARGIN
-    votes, voters = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
+    votes, voters = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     triangles = (soup.triangles - origin) / cell
     for axis in range(3):
         order = [(axis + 1) % 3, (axis + 2) % 3, axis]
@@ -41,12 +43,17 @@ def wrap(soup: Soup, cells: int) -> Soup | None:
         back = np.argsort(order)
         votes += within.transpose(back)
         voters += valid.transpose(back)
-    occupied = 2 * votes > voters
-    if not occupied.any():
+    points, owner = _samples(triangles)
+    free = np.ones(shape, bool)
+    free[tuple(np.round(points).astype(int).T)] = False
+    share = _settled(np.where(voters > 0, votes / np.maximum(voters, 1), 0.5), free)
+    if not (share > 0.5).any():
         return None
-    field = gaussian_filter(occupied.astype(np.float32), _SMOOTHING)
-    surface = march(field, 0.5)
-    return Soup(vertices=_drawn(surface.vertices, triangles) * cell + origin, faces=surface.faces)
+    surface = march(gaussian_filter((share > 0.5).astype(np.float32), _SMOOTHING), 0.5)
+    nearest = owner[KDTree(points).query(surface.vertices)[1]]
+    target = closest_point(triangles[nearest], surface.vertices)
+    near = np.linalg.norm(target - surface.vertices, axis=1, keepdims=True) <= 1
+    return Soup(vertices=np.where(near, target, surface.vertices) * cell + origin, faces=surface.faces)
 
 
 def march(field: Array, level: float) -> Soup:
@@ -109,15 +116,24 @@ def _twice_area(a: Array, b: Array, x: Array, y: Array) -> Array:
     return (b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])
 
 
-def _drawn(points: Array, triangles: Array) -> Array:
-    """Points (N, 3) moved to the nearest triangle where it is within a cell; lengths in cells."""
+def _samples(triangles: Array) -> tuple[Array, Ints]:
+    """Points (N, 3) on triangles (F, 3, 3) and the triangle (N,) of each, about two along a cell; lengths in cells."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    owner = np.repeat(np.arange(len(areas)), np.ceil(4 * areas).astype(int))  # about two samples along a cell
+    owner = np.repeat(np.arange(len(areas)), np.ceil(4 * areas).astype(int))
     u, v = np.random.default_rng(0).random((2, len(owner), 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     a, b, c = np.moveaxis(triangles[owner], 1, 0)
-    nearest = owner[KDTree(a + u * (b - a) + v * (c - a)).query(points)[1]]
-    target = closest_point(triangles[nearest], points)
-    near = np.linalg.norm(target - points, axis=1, keepdims=True) <= 1
-    return np.where(near, target, points)
+    return a + u * (b - a) + v * (c - a), owner
+
+
+def _settled(share: Array, free: NDArray[np.bool_]) -> Array:
+    """Shares of votes (X, Y, Z) after they have spread between the cells that the surface leaves free."""
+    weight = free.astype(np.float32)
+    shifts = [(step, axis) for step in (1, -1) for axis in range(3)]
+    around = 1 + np.sum([np.roll(weight, step, axis) for step, axis in shifts], axis=0)
+    for _ in range(_SPREADING):
+        held = share * weight
+        spread = share + sum(np.roll(held, step, axis) for step, axis in shifts)
+        share = np.where(free, spread / around, share)
+    return share
