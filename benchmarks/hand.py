@@ -66,13 +66,10 @@ def hand_force(cell: CellConfig) -> Section:
             for geom in (contact.geom1, contact.geom2):
                 name = data.model.geom(geom).name
                 sides[name] = sides.get(name, 0.0) + wrench[0]
-        squeeze = 1e6 * (BLOCK_M - state.opening_m)
-        rows.append(
-            (f"{force:.0f}", f"{sides['pad_left']:.2f}", f"{sides['pad_right']:.2f}", f"{squeeze:.0f}", state.grip.name)
-        )
+        rows.append((f"{force:.0f}", f"{sides['pad_left']:.2f}", f"{sides['pad_right']:.2f}", state.grip.name))
     return Section(
         title=f"Hand: normal force on each pad round a block of {1e3 * BLOCK_M:.0f} mm",
-        columns=("command N", "left N", "right N", "squeeze um", "state"),
+        columns=("command N", "left N", "right N", "state"),
         rows=rows,
     )
 
