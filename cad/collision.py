@@ -28,7 +28,7 @@ from cad.solids import to_mesh
 
 Purpose = Literal["rest", "grasp"]
 Method = Literal["hull", "cut", "coacd"]
-Limit = Literal["exact", "target", "threshold", "pieces", "time"]
+Limit = Literal["target", "threshold", "pieces", "time"]
 
 FILE = "collision.json"
 _CONVEX_M = _CORNER_M = 1e-6
@@ -65,8 +65,8 @@ class CollisionConfig:
 class CollisionReport:
     """How collision shapes were made and how well they match the part.
 
-    ``method`` is "hull", "cut" (along known features) or "coacd" with its ``threshold``; ``limit`` says why it was not
-    made finer. ``simplified_um`` is the largest error of the surface that was decomposed. Distances are from points all
+    ``method`` is "hull", "cut" (along known features) or "coacd" with its ``threshold``; ``limit`` says why CoACD's
+    were not made finer. ``simplified_um`` is the largest error of the surface that was decomposed. Distances are from points all
     over one solid's surface to the other solid: the largest, and the 99th percentile. ``hull_um`` is how far the convex
     hulls of the part and of all pieces together are apart, the error of a part at rest.
     """
@@ -82,7 +82,7 @@ class CollisionReport:
     missing_mm3: float
     hull_um: float
     simplified_um: float
-    limit: Limit
+    limit: Limit | None = None
     cpu_seconds: float = 0.0
     mesh_hash: str = ""
 
@@ -122,7 +122,7 @@ def find_collision_shapes(
         return stored
     start = time.process_time()
     hull = to_mesh(union_of_hulls([mesh]))
-    report = measure(mesh, [hull], method="hull", limit="exact")
+    report = measure(mesh, [hull], method="hull")
     if report.excess_max_um < 1e6 * _CONVEX_M:
         return CollisionShapes(pieces=(hull,), report=replace(report, cpu_seconds=_since(start)))
     simple, moved_um = _simplified(mesh, config)
@@ -152,7 +152,7 @@ def measure(
     pieces: Sequence[trimesh.Trimesh],
     *,
     method: Method,
-    limit: Limit = "exact",
+    limit: Limit | None = None,
     threshold: float | None = None,
     simplified_um: float = 0.0,
 ) -> CollisionReport:

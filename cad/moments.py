@@ -12,8 +12,11 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from cad.spatial import Array
+
+Ints = NDArray[np.int64]
 
 _DEGREE = 6
 _STARTS, _TRIALS = 240, 36
@@ -84,7 +87,7 @@ class _Polynomial:
         return self._monomials(u, powers) @ factors
 
     @staticmethod
-    def _monomials(u: Array, powers: Array) -> Array:
+    def _monomials(u: Array, powers: Ints) -> Array:
         """(N, M) products of the powers (M, 3) of the coordinates of u (N, 3)."""
         table = np.ones((powers.max() + 1, *u.shape))
         for k in range(1, len(table)):

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cad.meshes import surface_samples
 from cad.spatial import Array
+
+Ints = NDArray[np.int64]
 
 _SAMPLES = 40_000
 _TRIAL = 2000
@@ -40,7 +43,7 @@ class Surface:
     def nearest(self, points: Array) -> tuple[Array, Array]:
         """The surface's points nearest to points (N, 3), as far as single samples tell, and normals: (N, 3) both."""
         local = self._local(points)
-        index = self._triangle[self._tree.query(local)[1]]
+        index = self._triangle[np.asarray(self._tree.query(local)[1])]
         on_surface = trimesh.triangles.closest_point(np.asarray(self._mesh.triangles)[index], local)
         return self._origin + self._scale * on_surface, np.asarray(self._mesh.face_normals)[index]
 
@@ -82,7 +85,7 @@ class Surface:
         return (points - self._origin) / self._scale
 
 
-def _cloud(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+def _cloud(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, Ints]:
     """Points over the surface, corners of all triangles included, and the triangle of each: (N, 3), (N,)."""
     index = rng.choice(len(mesh.faces), size=count, p=mesh.area_faces / mesh.area)
     weights = rng.dirichlet(np.ones(3), size=count)

@@ -247,5 +247,5 @@ def _axis(R: Array) -> Array:
 
 def _across(axis: Array) -> Array:
     """A unit vector (3,) across ``axis``."""
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across = np.asarray(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]), dtype=np.float64)
     return across / np.linalg.norm(across)
