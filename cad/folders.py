@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import trimesh
 
+from cad.collision import CollisionShapes, write_collision
 from cad.keypoints import surface_keypoints
 from cad.meshes import check_mesh, write_mesh
 from cad.parts import hash_file
@@ -42,20 +42,17 @@ class PartFacts:
             raise ValueError(f"rgba {self.rgba}, metallic {self.metallic}, roughness {self.roughness}: all in 0 to 1")
 
 
-def write_part_folder(folder: Path, mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], facts: PartFacts) -> None:
-    """Write mesh.ply, hulls/, part.json, symmetries.json and keypoints.json; lengths in metres.
+def write_part_folder(folder: Path, mesh: trimesh.Trimesh, shapes: CollisionShapes, facts: PartFacts) -> None:
+    """Write mesh.ply, hulls/, collision.json, part.json, symmetries.json and keypoints.json; lengths in metres.
 
     Raises MeshError for a mesh or a hull that bounds no solid. Pieces of an earlier decomposition are removed.
     """
     check_mesh(mesh, facts.name)
-    for i, hull in enumerate(hulls):
-        check_mesh(hull, f"hull {i} of {facts.name}")
+    for i, piece in enumerate(shapes.pieces):
+        check_mesh(piece, f"hull {i} of {facts.name}")
     folder.mkdir(parents=True, exist_ok=True)
     write_mesh(mesh, folder / "mesh.ply")
-    for old in (folder / "hulls").glob("*.ply"):
-        old.unlink()
-    for i, hull in enumerate(hulls):
-        write_mesh(hull, folder / "hulls" / f"{i:03d}.ply")
+    write_collision(folder, shapes)
     _write_json(folder / "symmetries.json", models_info(mesh, find_symmetries(mesh)))
     _write_json(folder / "keypoints.json", {"keypoints_m": surface_keypoints(mesh).round(9).tolist()})
     info = asdict(facts)

@@ -26,7 +26,7 @@ class PartList:
 
     def run(self) -> None:
         """Print one line a part."""
-        from twin.report import print_parts
+        from twin.part_report import print_parts
 
         print_parts([load_part(name, self.parts_dir) for name in part_names(self.parts_dir)], as_json=self.json)
 
@@ -44,7 +44,7 @@ class PartShow:
 
     def run(self) -> None:
         """Print the part."""
-        from twin.report import print_part
+        from twin.part_report import print_part
 
         print_part(load_part(self.name, self.parts_dir), as_json=self.json)
 
@@ -82,7 +82,7 @@ class PartAdd:
     def run(self) -> None:
         """Add the part and print what it is."""
         from twin.new_part import NewPartConfig, add_part
-        from twin.report import describe_part, print_part
+        from twin.part_report import describe_part, print_part
 
         fields = [f.name for f in dataclasses.fields(NewPartConfig)]
         config = NewPartConfig(**{name: getattr(self, name) for name in fields})

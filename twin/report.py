@@ -1,20 +1,16 @@
-"""Tables on the terminal: scorecards and parts."""
+"""Scorecards on the terminal, and progress while they are made."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from cad.equivalence import symmetries_to_json
-from cad.parts import Part
 from twin.scorecard import SceneResult
 
 
@@ -107,55 +103,3 @@ def print_scorecard(card: dict[str, Any], out: Path) -> None:
         f"cycle {_number(card['cycle_s']['mean'], 2)} s simulated, {card['picks_per_hour']:.0f} picks an hour"
     )
     console.print(f"{out / 'scorecard.json'}", soft_wrap=True)
-
-
-def print_parts(parts: Sequence[Part], *, as_json: bool) -> None:
-    """One line a part."""
-    if as_json:
-        print(json.dumps([_describe(p) for p in parts], indent=1))
-        return
-    table = Table()
-    for column in ("part", "obj_id", "size mm", "mass g", "material", "triangles", "stable poses", "grasps"):
-        table.add_column(column, justify="left" if column in ("part", "material") else "right")
-    for part in parts:
-        size = " x ".join(f"{1e3 * s:.2f}" for s in part.mesh.extents)
-        row = (part.obj_id, size, f"{1e3 * part.mass_kg:.3f}", part.material, len(part.mesh.faces))
-        table.add_row(part.name, *map(str, row), str(len(part.stable_poses)), str(len(part.grasps)))
-    Console().print(table)
-
-
-def print_part(part: Part, *, as_json: bool) -> None:
-    """Size, mass, symmetries, stable poses with their probabilities and number of grasps, sources."""
-    if as_json:
-        print(json.dumps(_describe(part), indent=1))
-        return
-    console = Console()
-    print_parts([part], as_json=False)
-    table = Table(title="stable poses", title_justify="left")
-    for column in ("face", "probability", "height mm", "up in the part frame", "grasps"):
-        table.add_column(column, justify="right")
-    for pose in part.stable_poses:
-        up = np.round(pose.R_table_part[2], 3)
-        count = sum(g["stable_pose"] == pose.index for g in part.grasps)
-        table.add_row(str(pose.index), f"{pose.probability:.3f}", f"{1e3 * pose.height_m:.3f}", str(up), str(count))
-    console.print(table)
-    console.print(f"proper symmetries: {part.symmetries.describe()}; mesh {part.mesh_hash}; {part.folder}")
-    for source in part.sources:
-        console.print(f"source: {source}")
-
-
-def _describe(part: Part) -> dict[str, Any]:
-    return {
-        "name": part.name,
-        "obj_id": part.obj_id,
-        "size_mm": [1e3 * float(s) for s in part.mesh.extents],
-        "mass_kg": part.mass_kg,
-        "material": part.material,
-        "mesh_hash": part.mesh_hash,
-        "symmetries": symmetries_to_json(part.symmetries),
-        "stable_poses": [
-            {"index": p.index, "probability": p.probability, "height_m": p.height_m} for p in part.stable_poses
-        ],
-        "grasps": len(part.grasps),
-        "folder": str(part.folder),
-    }

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from build123d import Solid, export_step  # pyright: ignore[reportMissingImports]
 
+from cad.collision import cut_shapes
 from cad.folders import PartFacts, write_part_folder
 from cad.meshes import ANGULAR_DEFLECTION_RAD, DEFLECTION_MM, mesh_from_triangles
 from cad.models import usb_c
@@ -65,7 +66,8 @@ def build_part(name: str, library: Path) -> None:
     meshes = {key: [triangulate(s).apply_transform(in_mm) for s in group] for key, group in features.items()}
     hulls = [hull.apply_scale(1e-3) for hull in pieces(name, meshes)]
     solid = usb_c.fuse(features)
-    write_part_folder(library / name, triangulate(solid), hulls, FACTS[name])
+    mesh = triangulate(solid)
+    write_part_folder(library / name, mesh, cut_shapes(mesh, hulls), FACTS[name])
     export_step(solid, library / name / "source.step", timestamp=_EPOCH)
 
 

@@ -6,6 +6,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from cad.collision import cut_shapes
 from cad.decompose import winding_number
 from cad.folders import PartFacts, write_part_folder
 from cad.meshes import surface_samples
@@ -32,7 +33,7 @@ def facts(**changes):
 
 def write_brick(root, size=(8e-3, 6e-3, 3e-3), **changes):
     mesh = trimesh.creation.box(size)
-    write_part_folder(root / "brick", mesh, [mesh], facts(**changes))
+    write_part_folder(root / "brick", mesh, cut_shapes(mesh, [mesh]), facts(**changes))
     return root / "brick"
 
 
@@ -106,8 +107,8 @@ def test_a_mesh_that_changed_since_or_is_missing_is_refused(tmp_path):
 def test_writing_a_folder_again_leaves_no_old_pieces(tmp_path):
     folder = write_brick(tmp_path)
     mesh = trimesh.creation.box((8e-3, 6e-3, 3e-3))
-    write_part_folder(folder, mesh, [mesh] * 4, facts())
-    write_part_folder(folder, mesh, [mesh] * 2, facts())
+    write_part_folder(folder, mesh, cut_shapes(mesh, [mesh] * 4), facts())
+    write_part_folder(folder, mesh, cut_shapes(mesh, [mesh] * 2), facts())
     assert sorted(p.name for p in (folder / "hulls").iterdir()) == ["000.ply", "001.ply"]
     assert json.loads((folder / "part.json").read_text())["units"] == "m"
 
