@@ -39,6 +39,7 @@ class ContactRules:
     normal_tolerance: float = np.deg2rad(8.0)
     min_overlap_length_m: float = 0.6e-3
     min_overlap_height_m: float = 0.2e-3
+    min_overlap_line_m: float = 0.02e-3
     min_area_m2: float = 0.15e-6
     flat_roll: float = 0.3
     max_roll: float = 1.25
@@ -199,8 +200,10 @@ def pad_contact(view: JawView, b_centre_m: float, strip: PadStrip, rules: Contac
     curvature = np.mean([_curvature(p, n) for p, n in zip(places, leans, strict=True)], axis=0)
     (bulge, roll), directions = np.linalg.eigh(curvature * width / 2)
     reach, centre = _overlap(places, np.eye(2))
-    along = reach if roll < rules.flat_roll else np.array([_overlap(places, directions.T)[0][0], np.inf])
-    for length, needed in zip(along, (rules.min_overlap_length_m, rules.min_overlap_height_m), strict=True):
+    extent, across = reach, rules.min_overlap_height_m
+    if roll > rules.flat_roll:  # lines, which overlap along themselves and hardly across
+        extent, across = _overlap(places, directions.T)[0], rules.min_overlap_line_m
+    for length, needed in zip(extent, (rules.min_overlap_length_m, across), strict=True):
         if length < needed:
             return Missed(miss=Miss.NOT_FACING, figure=1e3 * max(0.0, float(length)), limit=1e3 * needed)
     if bulge > rules.max_bulge:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -96,8 +97,9 @@ def _with_margin(grasp: Grasp, margin: float) -> Grasp:
 def _judged(stable_pose: int, search: GraspSearch, held: Sequence[Grasp], failed: Sequence[Trial]) -> PoseGrasps:
     reasons = []
     if failed:
-        causes = Counter(trial.why.split(" by ")[0].split(":")[0] for trial in failed)
-        listed = ", ".join(f"{cause} ({n})" for cause, n in causes.most_common())
+        causes = Counter(re.sub(r"[-\d.]+", "", trial.why) for trial in failed)
+        examples = {re.sub(r"[-\d.]+", "", trial.why): trial.why for trial in failed}
+        listed = ", ".join(f"{examples[cause]} ({n} times)" for cause, n in causes.most_common())
         reasons.append(f"{len(held)} of {len(held) + len(failed)} trials in physics held: {listed}")
     misses = {m: n for m, n in search.rejections.items() if m.miss is not Miss.NOTHING} or search.rejections
     reasons += [f"{missed} ({n} places)" for missed, n in misses.items()]

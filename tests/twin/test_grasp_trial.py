@@ -32,7 +32,7 @@ def test_the_same_trial_ends_the_same(bench, grasp):
 
 def test_slippery_pads_lose_the_part(planned_brick, grasp):
     trial = TrialBench(planned_brick, TrialConfig(pad_friction=1e-4)).run(grasp)
-    assert not trial.held and ("lost" in trial.why or "slipped" in trial.why)
+    assert not trial.held and trial.why
 
 
 def test_a_hand_far_off_fails_and_one_a_little_off_does_not(bench, grasp):
@@ -48,6 +48,12 @@ def test_closing_centres_the_part_across_the_pads_only(bench, grasp):
     along = bench.run(grasp, (0.0, 0.3e-3, 0.0), whole=False)
     assert across.held and across.shift_m < 50e-6
     assert along.held and along.shift_m == pytest.approx(0.3e-3, abs=50e-6)
+
+
+@pytest.mark.parametrize("turn_deg", [0.5, 1.0, 3.0])
+def test_closing_askew_turns_the_part_square_without_throwing_it(bench, grasp, turn_deg):
+    turned = bench.run(grasp, (0.0, 0.0, np.deg2rad(turn_deg)), whole=False)
+    assert turned.held and turned.shift_m < 0.2e-3 and turned.shift_rad < np.deg2rad(2.0)
 
 
 def test_a_grasp_for_another_width_is_not_taken_for_a_grip(bench, grasp):
