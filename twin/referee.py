@@ -30,6 +30,7 @@ class Rules:
 
     lift_m: float = 0.050
     hold_s: float = 1.0
+    hold_look_s: float = 0.002  # how often it is looked whether both pads hold a part; touches are seen at every step
     hold_gap_s: float = 0.010  # contact may flicker this long between two solver steps without ending a hold
     place_m: float = 0.3e-3
     place_rad: float = np.radians(3.0)
@@ -92,6 +93,7 @@ class Referee:
         self._lifted_z = float(config.T_world_board[2, 3]) + self._rules.lift_m
         self._nests = {p.name: config.nest_frames(p.name) for p in parts}
         self.records = [self._present(i) for i in range(len(parts))]
+        self._timestep_s, self._next_look_s = float(model.opt.timestep), -np.inf
         self._held_since = np.full(len(parts), np.nan)
         self._held_last = np.full(len(parts), -np.inf)
         self._open = False
@@ -121,8 +123,10 @@ class Referee:
         self._touched |= self._contacts.touched
         for thing, point in self._contacts.strikes:
             self._strike(thing, point)
-        for i in self._contacts.held:
-            self._hold(i)
+        if self._data.time >= self._next_look_s:
+            self._next_look_s = self._data.time + self._rules.hold_look_s - 0.5 * self._timestep_s
+            for i in self._contacts.held:
+                self._hold(i)
 
     def finish(self) -> list[PartRecord]:
         """Let the world come to rest, close the last attempt and judge where every part lies."""

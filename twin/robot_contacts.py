@@ -6,7 +6,7 @@ sorted again only when it does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ _NONE = _Sorted(touched=frozenset(), strikes=(), between=())
 class RobotContacts:
     """Contacts of arm and hand in the step last made; call ``update`` after each step."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, part_bodies: Sequence[int]) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, part_bodies: Iterable[int]) -> None:
         """Part ``i`` is the body ``part_bodies[i]``; every other body is known by its name or its geoms' names."""
         self._data = data
         self._kind = _classify(model, part_bodies)
@@ -66,7 +66,10 @@ class RobotContacts:
     @property
     def strikes(self) -> list[tuple[str, Array]]:
         """Everything touched that is not a part: its name and the point (3,) in the world."""
-        return [(name, self._data.contact.pos[row].copy()) for row, name in self._sorted.strikes]
+        if not self._sorted.strikes:
+            return []
+        pos = self._data.contact.pos
+        return [(name, pos[row].copy()) for row, name in self._sorted.strikes]
 
     @property
     def held(self) -> list[int]:
@@ -102,7 +105,7 @@ def _is_robot(kind: int) -> bool:
     return RIGHT_PAD <= kind <= ROBOT
 
 
-def _classify(model: mujoco.MjModel, part_bodies: Sequence[int]) -> NDArray[np.int64]:
+def _classify(model: mujoco.MjModel, part_bodies: Iterable[int]) -> NDArray[np.int64]:
     """For each geom the index of the part it belongs to, or what else it is."""
     kind = np.full(model.ngeom, OTHER)
     part_of_body = {int(body): i for i, body in enumerate(part_bodies)}
