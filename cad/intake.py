@@ -77,8 +77,8 @@ def read_part(
     data, name = read_bytes(path), str(path)
     if path.suffix.lower() in CAD_SUFFIXES:
         declared = declared_unit(data)
-        soups = read_step(data, name, time_limit_s=config.time_limit_s)
         scale, unit, source = _step_scale(name, declared, unit)
+        soups = read_step(data, name, time_limit_s=config.time_limit_s)
     else:
         soups = read_triangles(data, path.suffix, name)
         source = "as asked" if unit else "mesh files name no unit; millimetres are the custom"

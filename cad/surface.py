@@ -25,7 +25,7 @@ _THIN = 1e-7
 """Volume per surface in metres below which a shell has no thickness to speak of."""
 _MOST_COMPARED = 50  # shells
 _MOST_PIECES = 200  # open, that holes are filled of
-_SLIGHT = 1e-6
+_SLIGHT = 1e-6  # share that is not worth a note
 _MOST_LOST = 0.02  # of the area, to walls between what was filled
 _SAMPLES = 4000
 _WRAP_SIMPLIFIED = 0.2  # cells
@@ -210,9 +210,9 @@ def _united(solids: list[Manifold], notes: list[str]) -> Manifold:
         if len(bodies) < len(union.decompose()):
             union = Manifold.compose(bodies)
         shared = sum(solid.volume() for solid in solids) - union.volume() + filled
-        overlap = f"; they overlap by {1e9 * shared:.3g} mm3" if shared > 1e-6 * union.volume() else ""
+        overlap = f"; they overlap by {1e9 * shared:.3g} mm3" if shared > _SLIGHT * union.volume() else ""
         notes.append(f"{len(solids)} solids united{overlap}")
-        if filled:
+        if filled > _SLIGHT * union.volume():
             notes.append(f"{1e9 * filled:.3g} mm3 that they enclose filled: the part counts as solid there")
         if len(bodies) > 1:
             notes.append(f"{len(bodies)} bodies without a common face are kept where they are, as one rigid part")
