@@ -62,7 +62,7 @@ class GripFigures:
 
 def study_rest(part: Part, config: ContactStudyConfig) -> RestFigures:
     """Lay the part on the board in each of its stable poses and watch."""
-    cell = CellConfig(timestep_s=config.timestep_s)
+    cell = CellConfig(timestep_s=config.timestep_s, parts_dir=part.folder.parent)
     model = _awake(build_board_scene(cell, [part.name]))
     data = mujoco.MjData(model)
     body = model.body(part_body(0)).id
@@ -80,7 +80,7 @@ def study_rest(part: Part, config: ContactStudyConfig) -> RestFigures:
 
 def study_grip(part: Part, grasp: Grasp, config: ContactStudyConfig) -> GripFigures:
     """Take the part, lift it, hold it, and carry it across the board. Raises RobotError when the arm is stopped."""
-    cell = CellConfig(timestep_s=config.timestep_s)
+    cell = CellConfig(timestep_s=config.timestep_s, parts_dir=part.folder.parent)
     model = _awake(build_workcell(cell, [part.name]))
     data = mujoco.MjData(model)
     T_world_part = cell.T_world_board @ transform(t=[-config.carry_m / 2, 0.0, 0.0])
