@@ -50,6 +50,7 @@ format: setup
 cad: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[cad]'
 	$(BIN)/python -m cad.models.build
+	$(BIN)/python -m cad.models.samples
 
 clean:
 	rm -rf $(VENV) build *.egg-info runs .pytest_cache .ruff_cache .import_linter_cache

@@ -2,4 +2,4 @@
 
 from importlib.util import find_spec
 
-collect_ignore = [] if find_spec("build123d") else ["test_usb_c.py"]
+collect_ignore = [] if find_spec("build123d") else ["test_samples.py", "test_usb_c.py"]
