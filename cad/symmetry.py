@@ -146,13 +146,15 @@ class _Solid:
         count = max(1, round(np.pi / order / _STEP_RAD)) if order else 1
         x = _across(axis)
         y = np.cross(axis, x)
-        found: list[tuple[float, Array]] = []
+        options: list[tuple[float, Array]] = []
         for angle in np.pi / (order or 1) * np.arange(count) / count:
             R = _turn(np.cos(angle) * x + np.sin(angle) * y, np.pi)
             if self.may_pass(R, self.slack_m):
-                found.append((float(self.surface.upper_bounds(self.some @ R.T).mean()), R))
-        for _, R in sorted(found, key=lambda item: item[0])[:_TRIES]:
-            R = _turn(_axis(self.refined(R)), np.pi)
+                options.append((float(self.surface.upper_bounds(self.some @ R.T).mean()), R))
+        for _, R in sorted(options, key=lambda item: item[0])[:_TRIES]:
+            found = _axis(self.refined(R))
+            found -= (found @ axis) * axis
+            R = _turn(found / np.linalg.norm(found), np.pi)
             if self.passes(R):
                 return [R]
         return []
@@ -167,7 +169,7 @@ class _Solid:
             if any(n % p == 0 for p in fails) or not self.may_pass(_turn(direction, angle), self.slack_m):
                 continue
             axis = _axis(self.refined(_turn(direction, angle)))
-            if self.passes(_turn(axis, angle)):
+            if all(self.passes(_turn(axis, k * angle)) for k in range(1, n // 2 + 1)):  # one may pass by chance
                 return n, axis
         return 1, direction
 
