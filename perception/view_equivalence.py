@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cad.parts import Part, StablePose, ViewEquivalent
-from cad.spatial import Array, apply, rotation_z, wrap_angle
+from cad.parts import Part, StablePose, ViewEquivalent, planar
+from cad.spatial import Array, apply, inverse, rotation_angle, rotation_z, wrap_angle, yaw_of
 from perception.silhouette import rasterise, solid_of
 
 SAME_VIEW_MM2 = 0.3
@@ -25,6 +25,8 @@ _HEIGHT_STEP_M = 1.5e-4  # a height difference above this is seen
 _NORMAL_COSINE = 0.94  # and so is a change of the surface normal by 20 degrees
 _COARSE_STEP = np.radians(5.0)
 _COARSE_LIMIT_MM2 = 6.0  # coarse minima above this are not worth refining: 2.5 degrees off costs about 2 mm^2
+_SNAP_RAD = np.radians(3.0)
+_LEVEL_RAD = np.radians(1.0)
 _ROUND_STEP = np.radians(10.0)  # a view that is the same at every yaw is listed at these
 
 
@@ -54,7 +56,8 @@ class TopView:
 def find_view_equivalents(part: Part) -> tuple[tuple[ViewEquivalent, ...], ...]:
     """For each stable pose of a part the other placements that look like it at yaw 0.
 
-    They go both ways: when pose b looks like pose a, pose a is listed for b.
+    They go both ways: when pose b looks like pose a, pose a is listed for b. Yaw and shift are exact where the part is
+    symmetric, else to half a degree and some tens of micrometres.
     """
     low, high = part.mesh.bounds
     size = int(np.ceil(np.linalg.norm(high - low) / _PIXEL_M)) + 8
@@ -66,10 +69,12 @@ def find_view_equivalents(part: Part) -> tuple[tuple[ViewEquivalent, ...], ...]:
             if np.abs(profiles[i] - profiles[j]).sum() > _COARSE_LIMIT_MM2:
                 continue
             b = views[j]
+            exact = _symmetric_placements(part, part.stable_poses[i], part.stable_poses[j])
             for yaw in _same_yaws(a, b, itself=i == j):
-                found[i].append(_equivalent(j, yaw, a, b))
+                placement = _snapped(planar(*_shift(a, b, yaw), yaw), exact)
+                found[i].append(_as_equivalent(j, placement))
                 if j != i:
-                    found[j].append(_equivalent(i, -yaw, b, a))
+                    found[j].append(_as_equivalent(i, inverse(placement)))
     return tuple(tuple(equivalents) for equivalents in found)
 
 
@@ -135,11 +140,28 @@ def _same_yaws(a: TopView, b: TopView, itself: bool) -> list[float]:
     return found
 
 
-def _equivalent(stable_pose: int, yaw: float, a: TopView, b: TopView) -> ViewEquivalent:
-    """``b``, the view of ``stable_pose``, looks like ``a`` when it is turned by ``yaw``."""
-    shift = a.centroid - rotation_z(yaw)[:2, :2] @ b.centroid
+def _shift(a: TopView, b: TopView, yaw: float) -> tuple[float, float]:
+    """By how much ``b``, turned by ``yaw``, is moved to lie where ``a`` does."""
+    x, y = a.centroid - rotation_z(yaw)[:2, :2] @ b.centroid
+    return float(x), float(y)
+
+
+def _symmetric_placements(part: Part, a: StablePose, b: StablePose) -> list[Array]:
+    """Motions in the table's plane (4, 4) that lay the part from pose ``b`` into pose ``a``, by its symmetries."""
+    motions = [a.T_table_part @ S @ inverse(b.T_table_part) for S in part.symmetries.elements]
+    return [motion for motion in motions if motion[2, 2] > np.cos(_LEVEL_RAD)]
+
+
+def _snapped(placement: Array, exact: list[Array]) -> Array:
+    """The exact motion (4, 4) that a placement found by comparing pixels is near to, else the placement itself."""
+    return next((T for T in exact if rotation_angle(T[:3, :3], placement[:3, :3]) < _SNAP_RAD), placement)
+
+
+def _as_equivalent(stable_pose: int, placement: Array) -> ViewEquivalent:
     return ViewEquivalent(
-        stable_pose=stable_pose, yaw=float(wrap_angle(yaw)), shift_m=(float(shift[0]), float(shift[1]))
+        stable_pose=stable_pose,
+        yaw=float(wrap_angle(yaw_of(placement[:3, :3]))),
+        shift_m=(float(placement[0, 3]), float(placement[1, 3])),
     )
 
 

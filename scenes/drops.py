@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from mujoco import rollout
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cad.parts import Part
 from cad.spatial import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from scenes.contacts import PART, Touches, make_collision, set_options
-from scenes.gl import mujoco
+from scenes.gl import mujoco, rollout
 
 _CLEARANCE_M = 5e-5
 _GRAVITY = 9.81

@@ -96,6 +96,7 @@ def _prepare() -> str:
 PROBLEM = _prepare()
 
 import mujoco  # noqa: E402  (MuJoCo reads the environment when it is imported)
+from mujoco import rollout  # noqa: E402, F401
 
 
 def make_context(width: int, height: int) -> Any:

@@ -172,11 +172,16 @@ class ShotSampler:
         return part, part.stable_poses[rng.integers(len(part.stable_poses))]
 
     def _rest(self, part: Part, pose: StablePose, x: float, y: float, rng: np.random.Generator) -> Placed:
-        """The part on one of its faces with any yaw, leaning a little as a grain of dust below it would make it."""
+        """The part on one of its faces with any yaw, and any roll if it has none of its own, leaning a little as a grain
+        of dust below it would make it.
+        """
         angle, direction = np.radians(rng.uniform(0, self._ranges.tilt_jitter_deg)), rng.uniform(0, 2 * np.pi)
         lean = rotation_from_rotvec([angle * np.cos(direction), angle * np.sin(direction), 0.0])
         T_board_table = planar(x, y, rng.uniform(-np.pi, np.pi))
-        T = T_board_table @ transform(lean) @ pose.T_table_part
+        T_table_part = pose.T_table_part
+        if pose.roll is not None:
+            T_table_part = T_table_part @ pose.roll.turn(rng.uniform(-np.pi, np.pi))
+        T = T_board_table @ transform(lean) @ T_table_part
         return Placed(name=part.name, stable_pose=pose.index, T_board_object=T)
 
     def _place_distractor(

@@ -112,7 +112,7 @@ def find_stable_poses(
         hull_deg=tuple(hull_deg for _, hull_deg, _ in found),
         spread_deg=tuple(spread_deg for _, _, spread_deg in found),
         drops=config.drops,
-        unassigned=float(1.0 - shares.sum()),
+        unassigned=float(len(ups) - counts[kept].sum()) / len(ups),
         unsettled=1.0 - len(ups) / config.drops,
         total_variation=float(np.abs(quasi_static - shares).sum() + rest) / 2,
         mesh_hash=part.mesh_hash,
@@ -203,7 +203,7 @@ def _settled(
     apart = float(face.angles(settled[None], part.symmetries)[0])
     exact = face.on_hull and apart <= config.exact_face_rad
     up = face.up if exact else settled
-    height = -float((part.mesh.vertices @ up).min()) if exact else float(np.median(heights))
+    height = 0.0 - float((part.mesh.vertices @ up).min()) if exact else float(np.median(heights))
     pose = _stable_pose(part.mesh, replace(face, up=up), height, float(share))
     spread = float(replace(face, up=up).angles(ups, part.symmetries).max())
     return pose, float(np.degrees(apart)) if face.on_hull else float("nan"), float(np.degrees(spread))
