@@ -22,11 +22,11 @@ from cad.folders import PartFacts, write_part_folder
 from cad.intake import Intake, read_part
 from cad.materials import material
 from cad.parts import BUILT_IN, Part, load_part, own_parts_dir, part_names
-from perception.view_equivalence import find_view_equivalents
 from scenes.part_preview import write_preview
-from scenes.stable_poses import StablePoseConfig, find_stable_poses, write_stable_poses
+from scenes.stable_poses import StablePoseConfig
 from twin.grasps import write_grasps
 from twin.robot import TwinError
+from twin.stable_pose_report import stable_pose_report
 
 _ASIDE, _REMOVED = ".adding", ".removed"
 
@@ -91,11 +91,8 @@ def add_part(config: NewPartConfig, report: Callable[[str], None] = lambda stage
             shapes = find_collision_shapes(intake.mesh)
             write_part_folder(folder, intake.mesh, shapes, _facts(config, intake))
             shutil.copyfile(config.file, folder / f"source{config.file.suffix.lower()}")
-        with stages.stage(f"stable poses from {config.drops} drops"):
-            result = find_stable_poses(_load(folder), StablePoseConfig(drops=config.drops, seed=config.seed))
-            write_stable_poses(folder, result)
-        with stages.stage("which poses look alike"):
-            write_stable_poses(folder, result, find_view_equivalents(_load(folder)))
+        with stages.stage(f"stable poses from {config.drops} drops, and which look alike"):
+            stable_pose_report(_load(folder), StablePoseConfig(drops=config.drops, seed=config.seed)).write()
         with stages.stage("grasps, each tried in physics"):
             write_grasps(_load(folder))
         with stages.stage("contact sheet"):

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
 from rich.console import Console
+from rich.progress import Progress
 from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
 from cad.parts import load_part, part_names
 
 Unit = Literal["mm", "cm", "m", "um", "in", "ft"]
+
+
+@contextmanager
+def progress_bar(name: str) -> Iterator[Callable[[float], None]]:
+    """A bar on standard error; yields what is to be told the share (0 to 1) that is done."""
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(name, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,6 +120,50 @@ class PartAdd:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PartStablePoses:
+    """How a part comes to rest: its stable poses with probabilities from drops, as a table and a plot."""
+
+    name: Positional[str]
+    """Name of the part."""
+    drops: int = 2000
+    """Drops in physics."""
+    seed: int = 0
+    """Seed of the drops."""
+    out: Path = Path("runs/stable_poses")
+    """Folder for NAME.png, the plot, and NAME.json, with every settled drop."""
+    write: bool = False
+    """Keep the poses in the part's folder, and plan its grasps anew."""
+    parts_dir: Path | None = None
+    """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
+    json: bool = False
+    """Print as JSON, without the drops."""
+
+    def run(self) -> None:
+        """Drop the part and print, plot and save what came of it."""
+        from scenes.stable_poses import StablePoseConfig
+        from twin.grasps import write_grasps
+        from twin.scorecard import write_json
+        from twin.stable_pose_plot import plot_stable_poses
+        from twin.stable_pose_report import print_stable_poses, stable_pose_report
+
+        part = load_part(self.name, self.parts_dir)
+        with progress_bar(f"dropping {self.name}") as advance:
+            report = stable_pose_report(part, StablePoseConfig(drops=self.drops, seed=self.seed), advance)
+        self.out.mkdir(parents=True, exist_ok=True)
+        document, plot = report.as_json(), self.out / f"{self.name}.png"
+        write_json(self.out / f"{self.name}.json", document)
+        plot_stable_poses(report, plot)
+        if self.write:
+            report.write()
+            write_grasps(load_part(self.name, self.parts_dir))
+        if self.json:
+            print(json.dumps({k: v for k, v in document.items() if k != "settled"} | {"plot": str(plot)}, indent=1))
+        else:
+            print_stable_poses(report)
+            print(plot)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PartRemove:
     """Remove one of your own parts."""
 
@@ -129,12 +184,13 @@ class PartRemove:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Part:
-    """Parts: list, show, add and remove them."""
+    """Parts: list, show, add and remove them, compute how they come to rest."""
 
     action: OmitSubcommandPrefixes[
         Annotated[PartList, subcommand("list")]
         | Annotated[PartShow, subcommand("show", prefix_name=False)]
         | Annotated[PartAdd, subcommand("add", prefix_name=False)]
+        | Annotated[PartStablePoses, subcommand("stable-poses", prefix_name=False)]
         | Annotated[PartRemove, subcommand("remove", prefix_name=False)]
     ]
 

@@ -95,7 +95,7 @@ def test_a_stopped_run_leaves_nothing_behind(tmp_path, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(new_part, "find_stable_poses", stop)
+    monkeypatch.setattr(new_part, "stable_pose_report", stop)
     config = NewPartConfig(file=block(tmp_path / "block.stl"), name="block", parts_dir=tmp_path / "own")
     with pytest.raises(KeyboardInterrupt):
         add_part(config)
