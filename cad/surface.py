@@ -163,11 +163,12 @@ def _joined(soup: Soup, config: RepairConfig, notes: list[str]) -> Soup:
 def _wrapped(soup: Soup, config: RepairConfig, notes: list[str]) -> list[Soup]:
     """A wrap around a soup; nothing where it encloses nothing."""
     wrapped = wrap(soup, config.wrap_cells)
-    if wrapped is None:
+    cell = float(np.ptp(soup.vertices, axis=0).max()) / config.wrap_cells
+    solid = Manifold() if wrapped is None else to_solid(wrapped).simplify(_WRAP_SIMPLIFIED * cell)
+    if solid.is_empty():
         notes.append(f"a surface of {_many(len(soup.faces), 'triangle')} that encloses nothing left out")
         return []
-    cell = float(np.ptp(soup.vertices, axis=0).max()) / config.wrap_cells
-    mesh = to_mesh(to_solid(wrapped).simplify(max(config.simplify_m, _WRAP_SIMPLIFIED * cell)))
+    mesh = to_mesh(solid)
     given = trimesh.Trimesh(soup.vertices, soup.faces, process=False)
     points = surface_samples(given, _SAMPLES, np.random.default_rng(0))[0]
     error = np.percentile(Surface(mesh).upper_bounds(points), 99)

@@ -265,7 +265,7 @@ def test_names_in_another_encoding_and_trailing_bytes_do_no_harm(tmp_path):
     files = {
         "obj": b"# " + latin + b"\n" + exported(mesh, "obj"),
         "off": exported(mesh, "off").replace(b"OFF\n", b"OFF\n# " + latin + b"\n"),
-        "ply": exported(mesh, "ply").replace(b"ply\n", b"ply\ncomment " + latin + b"\n", 1),
+        "ply": exported(mesh, "ply").replace(b" 1.0\n", b" 1.0\ncomment " + latin + b"\n", 1),
         "stl": exported(mesh, "stl_ascii").replace(b"solid", b"solid " + latin, 1),
         "STL": b"solid " + exported(mesh, "stl")[6:] + b"\r\n",  # binary, though it begins as text does
     }
