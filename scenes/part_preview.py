@@ -31,10 +31,20 @@ def contact_sheet(part: Part) -> NDArray[np.uint8]:
     return np.hstack([np.vstack(views) for views in columns])
 
 
+def labelled_sheet(part: Part) -> NDArray[np.uint8]:
+    """The contact sheet with the number and the probability of each pose written into its column."""
+    sheet = contact_sheet(part)
+    for k, pose in enumerate(part.stable_poses):
+        text = f"{pose.index}: {pose.probability:.3f}{' any roll' if pose.roll is not None else ''}"
+        at = (k * TILE_PX + 6, 2 * TILE_PX - 8)
+        cv2.putText(sheet, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 20, 20), 1, cv2.LINE_AA)
+    return sheet
+
+
 def write_preview(part: Part) -> Path:
     """Write ``preview.png`` into the part's folder and return its path."""
     path = part.folder / "preview.png"
-    cv2.imwrite(str(path), contact_sheet(part)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    cv2.imwrite(str(path), labelled_sheet(part)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return path
 
 

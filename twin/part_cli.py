@@ -113,9 +113,11 @@ class PartAdd:
         for note in added.intake.notes:
             console.print(f"note: {note}", highlight=False)
         print_part(added.part, as_json=False)
+        for stage, seconds in added.seconds.items():
+            console.print(f"{seconds:6.1f} s  {stage}", highlight=False)
         total = sum(added.seconds.values())
         console.print(
-            f"added in {total:.0f} s; try: tagcell pick --parts {self.name} --estimator oracle", highlight=False
+            f"{total:6.1f} s  in all; try: tagcell pick --parts {self.name} --estimator oracle", highlight=False
         )
 
 
