@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import Part, hash_file
+from cad.resting import as_rest
 from cad.spatial import Array, apply, inverse, transform, yaw_of
 from perception.calibration import table_from_board
 from perception.estimates import PerceptionError
@@ -113,7 +114,10 @@ def resting_poses(
     T_cam_board: Array,
     K: Array,
 ) -> Labels:
-    """Planar coordinates and projected centres of M parts from their poses; ``obj_id`` 0 stands for no part."""
+    """Planar coordinates and projected centres of M parts from their poses; ``obj_id`` 0 stands for no part.
+
+    A part in a pose that may roll is taken back to the stored roll first.
+    """
     index_of = {part.obj_id: i for i, part in enumerate(parts)} | {0: -1}
     unknown = sorted(set(obj_id.tolist()) - set(index_of))
     if unknown:
@@ -133,7 +137,10 @@ def resting_poses(
         pose = part.stable_poses[k]
         if (part_index[m], k) not in half_heights:
             half_heights[part_index[m], k] = apply(pose.T_table_part, part.mesh.vertices)[:, 2].max() / 2
-        T = inverse(T_cam_table[m]) @ T_cam_part[m] @ inverse(pose.T_table_part)
+        T_table_part = inverse(T_cam_table[m]) @ T_cam_part[m]
+        if pose.roll is not None:
+            T_table_part = as_rest(part, pose, T_table_part)
+        T = T_table_part @ inverse(pose.T_table_part)
         planar[m] = T[0, 3], T[1, 3], yaw_of(T[:3, :3])
         for row, z in enumerate((0.0, half_heights[part_index[m], k])):
             u, v, w = K[m] @ apply(T_cam_table[m], [planar[m, 0], planar[m, 1], z])

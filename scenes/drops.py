@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from cad.parts import Part
 from cad.spatial import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from scenes.contacts import PART, Touches, make_collision, set_options
+from scenes.errors import SceneError
 from scenes.gl import mujoco, rollout
 
 _CLEARANCE_M = 5e-5
@@ -81,8 +82,11 @@ def drop_part(
     """Drop ``part``, whose convex ``pieces`` touch the table, ``config.drops`` times.
 
     ``progress`` is told the share of the drops that are over. The result depends on the seed, not on the threads.
+    Raises SceneError for a part without pieces.
     """
     config = config or DropsConfig()
+    if not pieces:
+        raise SceneError(f"part {part.name!r} has no convex pieces to lie on (hulls/ in {part.folder}); add it again")
     model = _model(part, pieces, config)
     state = _starts(part, model, config)
     workers = [mujoco.MjData(model) for _ in range(config.threads)]

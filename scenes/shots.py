@@ -172,8 +172,9 @@ class ShotSampler:
         return part, part.stable_poses[rng.integers(len(part.stable_poses))]
 
     def _rest(self, part: Part, pose: StablePose, x: float, y: float, rng: np.random.Generator) -> Placed:
-        """The part on one of its faces with any yaw, and any roll if it has none of its own, leaning a little as a grain
-        of dust below it would make it.
+        """The part on one of its faces with any yaw, leaning a little as a grain of dust below it would make it.
+
+        A pose that may roll is rolled to any angle.
         """
         angle, direction = np.radians(rng.uniform(0, self._ranges.tilt_jitter_deg)), rng.uniform(0, 2 * np.pi)
         lean = rotation_from_rotvec([angle * np.cos(direction), angle * np.sin(direction), 0.0])
