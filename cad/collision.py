@@ -66,9 +66,9 @@ class CollisionReport:
     """How collision shapes were made and how well they match the part.
 
     ``method`` is "hull", "cut" (along known features) or "coacd" with its ``threshold``; ``limit`` says why CoACD's
-    were not made finer. ``simplified_um`` is the largest error of the surface that was decomposed. Distances are from points all
-    over one solid's surface to the other solid: the largest, and the 99th percentile. ``hull_um`` is how far the convex
-    hulls of the part and of all pieces together are apart, the error of a part at rest.
+    were not made finer. ``simplified_um`` is the largest error of the surface that was decomposed. Distances are from
+    points all over one solid's surface to the other solid: the largest, and the 99th percentile. ``hull_um`` is how far
+    the convex hulls of the part and of all pieces together are apart, the error of a part at rest.
     """
 
     method: Method
@@ -98,10 +98,11 @@ class CollisionShapes:
 def contact_pieces(part: Part, purpose: Purpose) -> tuple[trimesh.Trimesh, ...]:
     """The convex pieces (frame ``part``, metres) that stand for a part when it comes to ``rest`` or is in a ``grasp``.
 
-    One hull is the exact shape for resting on a plane, but MuJoCo keeps at most four of the contacts between a pair of
-    geoms, and a part whose large flat face has many corners rocks on them. The pieces have the same hull to a
-    micrometre (``hull_um``) and each keeps its own contacts, so they serve both purposes; a grasp inside a channel
-    needs them anyway.
+    Both get the pieces. One hull is the exact shape for resting on a plane, but MuJoCo keeps few contacts between a
+    pair of geoms: of 200 drops of ``top``, whose large face has many corners, 30 % never lie still on the hull, and all
+    do on the pieces; a pin header lies 0.028 degrees askew on the hull and 0.003 on its 45 pieces, which sink in
+    by 0.3 um instead of 2.8 um. Pieces together have the part's hull to a micrometre (``hull_um``), so none stands
+    proud of a face to rest on. ``python -m benchmarks.geometry`` prints this comparison.
     """
     if purpose not in ("rest", "grasp"):
         raise ValueError(f"purpose {purpose!r}: use rest or grasp")
