@@ -23,7 +23,8 @@ class GraspConfig:
 
     ``clearance_m`` is what the fingers leave free on either side of a part before they close, down to
     ``min_clearance_m`` where neighbours or the stroke do not allow more. The hand does not notice parts narrower than
-    ``min_width_m``. ``keep`` candidates of a stable pose are tried in physics until ``enough`` of them have held.
+    ``min_width_m``. ``keep`` candidates of a stable pose are tried in physics until ``enough`` of them have held,
+    fewer of a part of many convex pieces, each trial of which takes long: ``pieces_in_trials`` over all.
     """
 
     yaw_step: float = np.deg2rad(5.0)
@@ -40,6 +41,7 @@ class GraspConfig:
     min_width_m: float = 0.4e-3
     keep: int = 12
     enough: int = 8
+    pieces_in_trials: int = 240
     rules: ContactRules = field(default_factory=ContactRules)
 
     def __post_init__(self) -> None:
@@ -58,6 +60,10 @@ class GraspConfig:
     def max_width_m(self) -> float:
         """The widest that a part may be between the pads."""
         return gripper.STROKE_M - 2 * self.min_clearance_m
+
+    def enough_for(self, pieces: int) -> int:
+        """How many grasps of a stable pose are enough for a part of that many convex pieces."""
+        return max(1, min(self.enough, self.pieces_in_trials // max(1, pieces)))
 
     def clearance_at(self, width_m: float) -> float:
         """Clearance on either side with which the fingers come down on a part of that width."""

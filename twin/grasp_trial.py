@@ -5,6 +5,7 @@ Board, part, fingers and contacts are those of the cell, and heights, speeds and
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -81,9 +82,10 @@ class TrialBench:
         """Try ``grasp`` with the hand off by ``offset``; ``whole`` False stops once the part is lifted and held."""
         return _Run(self, grasp, offset).result(whole=whole)
 
-    def margin(self, grasp: Grasp) -> float:
+    def margin(self, grasp: Grasp, pool: Executor) -> float:
         """The share of the configured offsets of the hand with which the part is still lifted and held."""
-        return float(np.mean([self.run(grasp, offset, whole=False).held for offset in self.config.offsets]))
+        trials = pool.map(lambda offset: self.run(grasp, offset, whole=False), self.config.offsets)
+        return float(np.mean([trial.held for trial in trials]))
 
 
 class _Run:

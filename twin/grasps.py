@@ -12,7 +12,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -25,8 +25,8 @@ from twin.grasp_geometry import Miss, sample_surface
 from twin.grasp_search import GraspSearch, find_grasps
 from twin.grasp_trial import TrialBench, TrialConfig
 
-_SLIP_M, _SLIP_RAD = 0.1e-3, np.deg2rad(1.0)
-"""A grasp that slips by this in its trial counts 1 / e of one that does not."""
+_STRAY_M, _STRAY_RAD = 0.1e-3, np.deg2rad(1.0)
+"""A grasp whose part strays by this in its trial counts 1 / e of one whose part does not."""
 _MARGIN_TESTS = 4
 _FILE = "grasps.json"
 
@@ -56,26 +56,29 @@ def plan_grasps(
         return tuple(_judged(k, search, [], []) for k, search in enumerate(searches))
     bench = TrialBench(part, trial)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return tuple(pool.map(lambda k: _try_pose(k, searches[k], bench, config), range(len(searches))))
+        return tuple(_try_pose(k, search, bench, config, pool) for k, search in enumerate(searches))
 
 
-def _try_pose(stable_pose: int, search: GraspSearch, bench: TrialBench, config: GraspConfig) -> PoseGrasps:
+def _try_pose(
+    stable_pose: int, search: GraspSearch, bench: TrialBench, config: GraspConfig, pool: Executor
+) -> PoseGrasps:
     """Try the candidates of a pose, best first, until enough have held; then see what errors the best ones bear."""
     held: list[Grasp] = []
     failed: list[Trial] = []
-    for grasp in search.grasps:
-        trial = bench.run(grasp)
-        if not trial.held:
-            failed.append(trial)
-            continue
-        held.append(replace(grasp, trial=trial, quality=grasp.quality * _steadiness(trial)))
-        if len(held) == config.enough:
-            break
+    enough = config.enough_for(len(bench.part.hulls))
+    waiting = list(search.grasps)
+    while waiting and len(held) < enough:
+        batch, waiting = waiting[: enough - len(held)], waiting[enough - len(held) :]
+        for grasp, trial in zip(batch, pool.map(bench.run, batch), strict=True):
+            if trial.held:
+                held.append(replace(grasp, trial=trial, quality=grasp.quality * _steadiness(trial)))
+            else:
+                failed.append(trial)
     for _ in range(_MARGIN_TESTS):
         held.sort(key=lambda g: -g.quality)
         if not held or _trial_of(held[0]).margin is not None:
             break
-        held[0] = _with_margin(held[0], bench.margin(held[0]))
+        held[0] = _with_margin(held[0], bench.margin(held[0], pool))
     return _judged(stable_pose, search, sorted(held, key=lambda g: -g.quality), failed)
 
 
@@ -85,8 +88,10 @@ def _trial_of(grasp: Grasp) -> Trial:
 
 
 def _steadiness(trial: Trial) -> float:
-    """Share in (0, 1] by which slip in the hand lowers a grasp's quality."""
-    return float(np.exp(-trial.slip_m / _SLIP_M - trial.slip_rad / _SLIP_RAD))
+    """Share in (0, 1] by which what the part moved in its trial lowers a grasp's quality."""
+    metres = max(trial.shift_m, trial.slip_m, trial.place_m)
+    radians = max(trial.shift_rad, trial.slip_rad, trial.place_rad)
+    return float(np.exp(-metres / _STRAY_M - radians / _STRAY_RAD))
 
 
 def _with_margin(grasp: Grasp, margin: float) -> Grasp:

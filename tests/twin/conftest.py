@@ -45,7 +45,7 @@ def make_part(tmp_path):
 def planned_brick(tmp_path_factory):
     """A box of 8 x 6 x 3 mm with its grasps, planned once; not to be changed."""
     part = write_part(tmp_path_factory.mktemp("planned"), trimesh.creation.box([8e-3, 6e-3, 3e-3]))
-    write_grasps(part, GraspConfig(sample_spacing_m=0.2e-3, yaw_step=np.pi / 6))
+    write_grasps(part, GraspConfig(sample_spacing_m=0.2e-3, yaw_step=np.pi / 6, enough=6))
     return part
 
 
