@@ -113,7 +113,9 @@ class _Solid:
 
     def passes(self, R: Array) -> bool:
         """Whether the rotation is a symmetry."""
-        return self.may_pass(R) and self.surface.all_within(self.points @ R.T, self.tolerance_m)
+        if not self.may_pass(R):
+            return False
+        return all(self.surface.all_within(points @ R.T, self.tolerance_m) for points in (self.some, self.points))
 
     def refined(self, R: Array) -> Array:
         """The rotation next to ``R`` that lays the solid on itself best: distances along normals, least squares."""
@@ -165,11 +167,13 @@ class _Solid:
         if len(fails) == len(_PRIMES):
             return 1, direction
         for n in range(MAX_ORDER, 1, -1):
-            angle = 2 * np.pi / n
-            if any(n % p == 0 for p in fails) or not self.may_pass(_turn(direction, angle), self.slack_m):
+            angles = 2 * np.pi / n * np.arange(1, n // 2 + 1)  # all of them: one may pass by chance
+            if any(n % p == 0 for p in fails):
                 continue
-            axis = _axis(self.refined(_turn(direction, angle)))
-            if all(self.passes(_turn(axis, k * angle)) for k in range(1, n // 2 + 1)):  # one may pass by chance
+            if not all(self.may_pass(_turn(direction, angle), self.slack_m) for angle in angles):
+                continue
+            axis = _axis(self.refined(_turn(direction, angles[0])))
+            if all(self.passes(_turn(axis, angle)) for angle in angles):
                 return n, axis
         return 1, direction
 

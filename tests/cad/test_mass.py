@@ -91,8 +91,8 @@ def test_a_segment_of_a_sphere():
     centre = 3 * (2 * radius - height) ** 2 / (4 * (3 * radius - height))
     z = np.linspace(floor, radius, 200_001)
     rim = radius**2 - z**2
-    axial = DENSITY * np.pi / 2 * np.trapezoid(rim**2, z)
-    across = axial / 2 + DENSITY * np.pi * np.trapezoid(rim * (z - centre) ** 2, z)
+    axial = float(DENSITY * np.pi / 2 * np.trapezoid(rim**2, z))
+    across = float(axial / 2 + DENSITY * np.pi * np.trapezoid(rim * (z - centre) ** 2, z))
     assert mesh.volume == pytest.approx(volume, rel=3e-4)
     np.testing.assert_allclose(mesh.center_mass, [0, 0, centre], atol=3e-7)
     np.testing.assert_allclose(moments(mesh), [across, across, axial], rtol=5e-4)
