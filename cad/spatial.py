@@ -83,7 +83,9 @@ def rotvec_from_rotation(R: ArrayLike) -> Array:
 
 def rotation_angle(R_a: Array, R_b: Array) -> float:
     """Angle in rad between two rotations, in [0, pi] (geodesic; accurate near zero, unlike acos of the trace)."""
-    return float(np.linalg.norm(rotvec_from_rotation(R_a.T @ R_b)))
+    R = R_a.T @ R_b
+    twice_sine = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(np.sqrt(twice_sine @ twice_sine), R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
 def yaw_of(R: Array) -> float:

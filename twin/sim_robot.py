@@ -80,9 +80,9 @@ class SimRobot:
         self._arm_inputs = arm_inputs(model)
         self._hand = SimHand(model, data)
         self._hold_s = (self._config.control_period_s + float(model.opt.timestep)) / 2
-        self._inertia = np.zeros(model.nv)
+        self._inertia, self._acceleration = np.zeros(model.nv), np.zeros(model.nv)
         self._q_target = data.qpos[self._qpos].copy()
-        self._command(self._q_target, np.zeros(6), np.zeros(6))
+        self._hold(self._q_target)
 
     # -- Robot ----------------------------------------------------------------------------------------------------
 
@@ -147,7 +147,7 @@ class SimRobot:
     def stop(self) -> None:
         """Stop all motion now: the arm holds where it is, and so do fingers that are not gripping anything."""
         self._q_target = self._data.qpos[self._qpos].copy()
-        self._command(self._q_target, np.zeros(6), np.zeros(6))
+        self._hold(self._q_target)
         self._hand.stop()
 
     def wait(self, duration_s: float) -> None:
@@ -159,12 +159,13 @@ class SimRobot:
 
     def _follow(self, q: Array, qd: Array, qdd: Array, q_end: Array) -> None:
         """Run through the set points, one row (6,) a control period, and settle at ``q_end`` (6,)."""
-        for row in zip(q, qd, qdd, strict=True):
-            self._command(*row)
+        h = self._hold_s
+        for inputs, target in zip(np.stack([q - h * qd, qd - h * qdd, qdd], axis=1), q, strict=True):
+            self._command(inputs)
             self._period()
-            self._check_tracking(row[0])
+            self._check_tracking(target)
         self._q_target = q_end.copy()
-        self._command(q_end, np.zeros(6), np.zeros(6))
+        self._hold(q_end)
         waited_s = 0.0
         while not self._settled(q_end):
             if waited_s > self._config.settle_limit_s:
@@ -178,18 +179,20 @@ class SimRobot:
             waited_s += self._config.control_period_s
         self._check_finite()
 
-    def _command(self, q: Array, qd: Array, qdd: Array) -> None:
-        """Bring the servos to ``q``, ``qd`` (6,) by the end of the period; the torque for ``qdd`` is fed forward.
+    def _hold(self, q: Array) -> None:
+        """Set points of the servos that hold the arm at ``q`` (6,)."""
+        self._command(np.stack([q, np.zeros(6), np.zeros(6)]))
+
+    def _command(self, inputs: Array) -> None:
+        """Give the servos angles, speeds and accelerations (3, 6); what torque the last need is fed forward.
 
         Servos hold their set points for a whole period and follow them on average: what they get is that of its middle.
         """
-        torque = qdd
-        if qdd.any():
-            acceleration = np.zeros(self._model.nv)
-            acceleration[self._dofs] = qdd
-            mujoco.mj_mulM(self._model, self._data, self._inertia, acceleration)
-            torque = self._inertia[self._dofs]
-        self._data.ctrl[self._arm_inputs] = q - self._hold_s * qd, qd - self._hold_s * qdd, torque
+        if inputs[2].any():
+            self._acceleration[self._dofs] = inputs[2]
+            mujoco.mj_mulM(self._model, self._data, self._inertia, self._acceleration)
+            inputs[2] = self._inertia[self._dofs]
+        self._data.ctrl[self._arm_inputs] = inputs
 
     def _period(self) -> None:
         """One control period of the hand's controller and of physics."""
