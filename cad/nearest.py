@@ -68,12 +68,11 @@ class Surface:
         """Largest distance of points (N, 3) from the surface."""
         bounds = self.upper_bounds(points, _NEIGHBOURS)
         order = np.argsort(-bounds)
-        largest = 0.0
-        for start in range(0, len(order), _MANY):
-            group = order[start : start + _MANY]
-            if bounds[group[0]] <= largest:
-                break
+        largest, start, size = 0.0, 0, _EXACT
+        while start < len(order) and bounds[order[start]] > largest:
+            group = order[start : start + size]
             largest = max(largest, float(self.distance(points[group]).max()))
+            start, size = start + size, min(2 * size, _MANY)
         return largest
 
     def surely_beyond(self, points: Array, distance: float) -> bool:

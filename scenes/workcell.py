@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
+from cad.collision import contact_pieces
 from cad.parts import LIBRARY, Part, load_mesh, load_part
 from cad.spatial import Array, Intrinsics, quat_wxyz_from_rotation, transform
 from cad.station import COLLISION, TABLE_THICKNESS_M, TABLE_X_M, TABLE_Y_M
@@ -78,7 +79,7 @@ def _add_parts(spec: mujoco.MjSpec, config: CellConfig, part_names: Sequence[str
     for part in parts.values():
         add_mesh(spec, f"{part.name}_visual", part.mesh)
         add_part_material(spec, part.name, part)
-        for k, hull in enumerate(part.hulls):
+        for k, hull in enumerate(contact_pieces(part, "grasp")):
             _add_hull(spec, f"{part.name}_hull_{k:02d}", hull)
     for i, name in enumerate(part_names):
         _add_part(spec, i, parts[name])
@@ -175,7 +176,7 @@ def _add_part(spec: mujoco.MjSpec, index: int, part: Part) -> None:
     body.ipos = solid.center_mass
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     add_visual(body, f"{name}_visual", f"{part.name}_visual", material=part.name)
-    for k in range(len(part.hulls)):
+    for k in range(len(contact_pieces(part, "grasp"))):
         geom = body.add_geom(
             name=f"{name}_hull_{k:02d}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{part.name}_hull_{k:02d}"
         )
