@@ -74,6 +74,8 @@ def test_masks_are_the_projected_parts(which, request):
     for _, intrinsics, _, seen in images(request.getfixturevalue(which)):
         for part, _, T_cam_part, mask, _ in seen:
             truth = silhouette(part, intrinsics, T_cam_part)
+            if truth.sum() < 50:  # of a sliver at the border one pixel is a large share
+                continue
             overlaps.append((mask & truth).sum() / (mask | truth).sum())
     assert len(overlaps) > 10
     assert np.mean(overlaps) > 0.98
