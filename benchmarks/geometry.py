@@ -1,7 +1,8 @@
 """What a part's geometry is worth: python -m benchmarks.geometry [--parts NAME_OR_FILE ...].
 
 Symmetries found and how far they move the surface; collision shapes and what they have beyond the part and lack; and
-how drops end on one convex hull and on the pieces. Parts are names, or STEP, STL, OBJ or PLY files.
+how drops end on one convex hull and on the pieces for rest and for a
+grasp. Parts are names, or STEP, STL, OBJ or PLY files.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class GeometryBenchmark:
     unit: str | None = None
     """Unit of files: m, cm, mm or in."""
     drops: int = 200
-    """Drops on the hull and on the pieces; 0 leaves them out."""
+    """Drops on the hull and on each kind of pieces; 0 leaves them out."""
     seed: int = 0
     json: bool = False
     """Print JSON instead of tables."""
@@ -55,7 +56,8 @@ def main(options: GeometryBenchmark) -> None:
         shapes.append(_shape_row(part.name, report))
         if options.drops:
             hull = to_mesh(union_of_hulls([part.mesh]))
-            rests += [_rest_row(part, kind, ps, hull, options) for kind, ps in (("hull", [hull]), ("pieces", pieces))]
+            kinds = (("hull", (hull,)), ("rest", contact_pieces(part, "rest")), ("grasp", pieces))
+            rests += [_rest_row(part, kind, shape, hull, options) for kind, shape in kinds]
     sections = [
         Section(
             title="Rotational symmetries",
@@ -81,7 +83,7 @@ def main(options: GeometryBenchmark) -> None:
             rows=shapes,
         ),
         Section(
-            title="Drops on one hull and on the pieces (tilt from the hull's nearest face; 5th and 95th percentile)",
+            title="Drops on one hull and on the pieces for rest and grasp (tilt from the hull's nearest face; 5th and 95th percentile)",
             columns=("part", "shape", "still %", "tilt deg", "lowest corner um", "CPU s"),
             rows=rests,
         ),
@@ -95,7 +97,7 @@ def _subject(name: str, options: GeometryBenchmark) -> tuple[Part, tuple[trimesh
         part = load_part(name, options.parts_dir)
         stored = read_collision(part.folder)
         found = stored or find_collision_shapes(part.mesh)
-        return part, contact_pieces(part, "rest"), found.report
+        return part, contact_pieces(part, "grasp"), found.report
     mesh = read_part(Path(name), unit=options.unit).mesh
     made = find_collision_shapes(mesh)
     part = Part(
@@ -152,7 +154,7 @@ def _shape_row(name: str, report: CollisionReport) -> tuple[str, ...]:
 def _rest_row(
     part: Part,
     kind: str,
-    pieces: list[trimesh.Trimesh] | tuple[trimesh.Trimesh, ...],
+    pieces: tuple[trimesh.Trimesh, ...],
     hull: trimesh.Trimesh,
     options: GeometryBenchmark,
 ) -> tuple[str, ...]:
