@@ -1,8 +1,8 @@
 """What a part's geometry is worth: python -m benchmarks.geometry [--parts NAME_OR_FILE ...].
 
 Symmetries found and how far they move the surface; collision shapes and what they have beyond the part and lack; and
-how drops end on one convex hull and on the pieces for rest and for a
-grasp. Parts are names, or STEP, STL, OBJ or PLY files.
+how drops end on one convex hull and on the pieces for rest and for a grasp. Parts are names, or STEP, STL, OBJ or PLY
+files.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def main(options: GeometryBenchmark) -> None:
             rows=shapes,
         ),
         Section(
-            title="Drops on one hull and on the pieces for rest and grasp (tilt from the hull's nearest face; 5th and 95th percentile)",
+            title="Drops on one hull and on pieces (tilt from the nearest face of the hull; 5th and 95th percentile)",
             columns=("part", "shape", "still %", "tilt deg", "lowest corner um", "CPU s"),
             rows=rests,
         ),
