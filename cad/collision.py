@@ -23,6 +23,7 @@ from cad.decompose import DecomposeConfig, decompose
 from cad.meshes import write_mesh
 from cad.nearest import Surface
 from cad.parts import Part, hash_file, load_mesh
+from cad.rest_shape import rest_pieces
 from cad.shape_error import beyond, hulls_apart, solid_of, union_of_hulls
 from cad.solids import to_mesh
 
@@ -32,6 +33,7 @@ Limit = Literal["target", "threshold", "pieces", "time"]
 
 FILE = "collision.json"
 _CONVEX_M = _CORNER_M = 1e-6
+_MOST_TO_REST_ON = 32
 _NEXT_TAKES = 1.5  # times what this threshold took
 
 
@@ -98,15 +100,14 @@ class CollisionShapes:
 def contact_pieces(part: Part, purpose: Purpose) -> tuple[trimesh.Trimesh, ...]:
     """The convex pieces (frame ``part``, metres) that stand for a part when it comes to ``rest`` or is in a ``grasp``.
 
-    Both get the pieces. One hull is the exact shape for resting on a plane, but MuJoCo keeps few contacts between a
-    pair of geoms: of 200 drops of ``top``, whose large face has many corners, 30 % never lie still on the hull, and all
-    do on the pieces; a pin header lies 0.028 degrees askew on the hull and 0.003 on its 45 pieces, which sink in
-    by 0.3 um instead of 2.8 um. Pieces together have the part's hull to a micrometre (``hull_um``), so none stands
-    proud of a face to rest on. ``python -m benchmarks.geometry`` prints this comparison.
+    Resting, it stands on the same pieces as in the cell, whose hull is the part's to a micrometre (``hull_um``). Where
+    they are more than 32, for the time that they would take in thousands of drops, the hull's corners do
+    (``rest_pieces``): nothing else of a part meets a plane.
     """
     if purpose not in ("rest", "grasp"):
         raise ValueError(f"purpose {purpose!r}: use rest or grasp")
-    return part.hulls
+    few = purpose == "grasp" or 0 < len(part.hulls) <= _MOST_TO_REST_ON
+    return part.hulls if few else rest_pieces(part.mesh)
 
 
 def find_collision_shapes(
