@@ -84,7 +84,8 @@ class SceneTrial:
         set_camera_pose(self._model, self._data, T_board_cam)  # the camera's mount is part of the board's body
         self._robot = SimRobot(self._model, self._data, cell, on_step=self._step)
         width, height = cell.intrinsics.width, cell.intrinsics.height
-        self._renderer = ClassicRenderer(self._model, max_width=width, max_height=height)
+        blind = estimator is None and not config.pictures  # nobody looks at what the oracle's camera sees
+        self._renderer = None if blind else ClassicRenderer(self._model, max_width=width, max_height=height)
         self._camera = SimCamera(self._model, self._data, self._renderer, rng=np.random.default_rng(noise))
         self._estimator = estimator or OracleEstimator(self._model, self._data, self._parts, cell)
         self._referee = Referee(self._model, self._data, cell, self._parts)
@@ -114,7 +115,8 @@ class SceneTrial:
             self._draw_pending()
             records = self._referee.finish()
         finally:
-            self._renderer.close()
+            if self._renderer is not None:
+                self._renderer.close()
         attempts = controller.attempts
         for attempt in attempts:
             i = self._nearest(attempt.T_base_part, attempt.part)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cad.spatial import BASLER, Intrinsics
 from perception.estimates import Frame
@@ -16,14 +17,14 @@ class SimCamera:
 
     Every capture lets ``latency_s`` of simulated time pass after the exposure: readout, transfer and the time that a
     real estimator would take on the frame. Noise comes from ``rng``; a frame is stamped with the simulated time of
-    its exposure.
+    its exposure. Without a ``renderer`` frames stay black, for an estimator that never looks at them.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        renderer: Renderer,
+        renderer: Renderer | None,
         *,
         rng: np.random.Generator,
         intrinsics: Intrinsics = BASLER,
@@ -38,11 +39,15 @@ class SimCamera:
     def capture(self) -> Frame:
         """See :class:`twin.robot.Camera`."""
         mujoco.mj_forward(self._model, self._data)
-        ideal = self._renderer.render(self._data, self._intrinsics, ("rgb",)).rgb
-        assert ideal is not None
-        exposed_s = float(self._data.time)
-        frame = Frame(image=expose(ideal, self._sensor, self._rng), intrinsics=self._intrinsics, time_s=exposed_s)
+        frame = Frame(image=self._image(), intrinsics=self._intrinsics, time_s=float(self._data.time))
         steps = round(self._latency_s / self._model.opt.timestep)
         if steps:
             mujoco.mj_step(self._model, self._data, steps)
         return frame
+
+    def _image(self) -> NDArray[np.uint8]:
+        if self._renderer is None:
+            return np.zeros((self._intrinsics.height, self._intrinsics.width, 3), np.uint8)
+        ideal = self._renderer.render(self._data, self._intrinsics, ("rgb",)).rgb
+        assert ideal is not None
+        return expose(ideal, self._sensor, self._rng)
