@@ -50,12 +50,14 @@ class DropsConfig:
 
     def __post_init__(self) -> None:
         if self.drops < 1 or self.threads < 1:
-            raise ValueError(f"drops {self.drops}, threads {self.threads}: both must be at least 1")
+            raise SceneError(f"drops {self.drops}, threads {self.threads}: both must be at least 1")
+        if self.seed < 0:
+            raise SceneError(f"seed {self.seed}: it must not be negative")
         for name in ("height_m", "timestep_s", "rocking_m", "rocking_rad", "drift_m", "drift_rad"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name} {getattr(self, name)}: it must be positive")
+                raise SceneError(f"{name} {getattr(self, name)}: it must be positive")
         if not 2 * self.timestep_s <= self.stage_s <= self.duration_s:
-            raise ValueError(
+            raise SceneError(
                 f"timestep {self.timestep_s} s, stage {self.stage_s} s, duration {self.duration_s} s: a stage must be "
                 "at least two steps long, a drop at least one stage"
             )

@@ -75,6 +75,8 @@ class DatasetConfig:
         for name in ("count", "jobs", "chunk"):
             if getattr(self, name) < 1:
                 raise SceneError(f"{name} {getattr(self, name)}: must be at least 1")
+        if self.seed < 0:
+            raise SceneError(f"seed {self.seed}: must not be negative")
         if self.chunk > 1000:
             raise SceneError(f"chunk {self.chunk}: BOP allows at most 1000 images a folder")
 

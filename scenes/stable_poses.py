@@ -49,7 +49,7 @@ class StablePoseConfig(DropsConfig):
         super().__post_init__()
         for name in ("min_probability", "max_unassigned"):
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} {getattr(self, name)}: it must be in 0 to 1")
+                raise SceneError(f"{name} {getattr(self, name)}: it must be in 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,6 +10,7 @@ from typing import get_type_hints
 from perception.fit_choice import ChoiceFitConfig, fit_choice
 from perception.train import trainer
 from scenes.generate import DatasetConfig, generate
+from twin.robot import TwinError
 
 DATASETS: dict[str, DatasetConfig] = {
     "crops_train": DatasetConfig(kind="crop", split="train", count=20_000, seed=1),
@@ -32,11 +33,13 @@ SHARES: dict[str, tuple[str, float]] = {
 def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int, jobs: int | None = None) -> list[Path]:
     """Weights of every network, and the choice fitted on them, in ``out/weights``; returns their paths.
 
-    Raises SceneError or PerceptionError when a folder holds other data or cannot be written, ValueError for a budget
-    that is not positive. What is there already, data and checkpoints, is kept.
+    Raises SceneError or PerceptionError when a folder holds other data or cannot be written, TwinError for a budget
+    that is not positive or a negative seed. What is there already, data and checkpoints, is kept.
     """
     if not minutes > 0:
-        raise ValueError(f"minutes is {minutes}; it must be positive")
+        raise TwinError(f"minutes is {minutes}; it must be positive")
+    if seed < 0:
+        raise TwinError(f"seed is {seed}; it must not be negative")
     for name, config in DATASETS.items():
         generate(_for_run(config, seed, jobs or os.cpu_count() or 1), data / name)
     written = []

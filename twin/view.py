@@ -16,13 +16,19 @@ from scenes.render import ClassicRenderer
 from scenes.workcell import OVERVIEW, OVERVIEW_INTRINSICS, CellConfig, build_arm, build_workcell, set_parts
 from twin.ik import ArmIk
 from twin.pictures import save_picture
+from twin.robot import TwinError
 
 FRAME_WIDTH = 1368
 ROOM = "room_"
 
 
 def save_views(out: Path, *, seed: int, parts_per_class: int = 2) -> list[Path]:
-    """Drop parts from ``seed``, hold the hand above the board and save cell.jpg, camera.jpg in ``out``."""
+    """Drop parts from ``seed``, hold the hand above the board and save cell.jpg, camera.jpg in ``out``.
+
+    Raises TwinError for a negative seed.
+    """
+    if seed < 0:
+        raise TwinError(f"seed is {seed}; it must not be negative")
     cell = CellConfig()
     instances = [name for name in BUILT_IN for _ in range(parts_per_class)]
     T_world_part = settle_parts(cell, instances, np.random.default_rng(seed))

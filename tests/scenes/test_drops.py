@@ -117,8 +117,16 @@ def test_a_part_without_pieces_is_refused(brick):
 
 @pytest.mark.parametrize(
     "bad",
-    [{"drops": 0}, {"threads": 0}, {"height_m": 0.0}, {"drift_rad": -1.0}, {"stage_s": 3.0}, {"stage_s": 1e-3}],
+    [
+        {"drops": 0},
+        {"seed": -1},
+        {"threads": 0},
+        {"height_m": 0.0},
+        {"drift_rad": -1.0},
+        {"stage_s": 3.0},
+        {"stage_s": 1e-3},
+    ],
 )
 def test_impossible_settings_are_refused(bad):
-    with pytest.raises(ValueError, match=r"drops|height|drift|stage"):
+    with pytest.raises(SceneError, match=r"drops|seed|height|drift|stage"):
         DropsConfig(**bad)

@@ -182,7 +182,7 @@ def test_a_demand_no_pose_meets_is_an_error(brick):
 
 @pytest.mark.parametrize("bad", [{"drops": 0}, {"min_probability": 1.0}, {"max_unassigned": -0.1}])
 def test_impossible_settings_are_refused(bad):
-    with pytest.raises(ValueError, match=r"drops|min_probability|max_unassigned"):
+    with pytest.raises(SceneError, match=r"drops|min_probability|max_unassigned"):
         StablePoseConfig(**bad)
 
 

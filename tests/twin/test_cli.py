@@ -33,6 +33,23 @@ def test_counts_outside_their_range_are_refused(capsys, flag, value):
     assert code == 2 and f"{flag[2:]} is {value}; it must be between 1 and" in text
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("part stable-poses main --drops 0", "drops 0"),
+        ("part stable-poses main --seed -1", "seed -1"),
+        ("render --seed -1", "seed -1"),
+        ("train --minutes -1", "minutes is -1"),
+        ("train --seed -1", "seed is -1"),
+        ("view --seed -1", "seed is -1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_by_name(capsys, monkeypatch, tmp_path, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    code, text = fails(capsys, *arguments.split())
+    assert code == 1 and text.startswith(f"tagcell: {said}")
+
+
 def test_a_value_of_the_wrong_kind_names_flag_and_value(capsys):
     code, text = fails(capsys, "pick", "--scenes", "many")
     assert code == 2 and "--scenes" in text and "'many'" in text
