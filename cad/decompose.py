@@ -2,7 +2,7 @@
 
 CoACD (Wei et al., SIGGRAPH 2022) suits solid parts. On sheet of 0.3 mm it needs 60 to 95 pieces and still stands tens
 of micrometres proud; a part made of known convex features is cut along them instead (``cut``), which is exact on flat
-faces. ``excess_m`` says how far pieces stand outside the part, whichever way they were made.
+faces. ``cad.collision`` measures how far pieces stand outside the part, whichever way they were made.
 """
 
 from __future__ import annotations
@@ -14,14 +14,11 @@ import coacd
 import numpy as np
 import trimesh
 
-from cad.meshes import distance_to_surface, surface_samples
 from cad.parts import CadError
 from cad.spatial import Array
 
 Plane = tuple[tuple[float, float, float], float]
 """Normal n and offset d: the half-space n . p <= d."""
-
-_CHUNK = 256
 
 
 class DecompositionError(CadError):
@@ -98,32 +95,6 @@ def hull_of(points: Array) -> trimesh.Trimesh:
     if not hull.volume > 0:
         raise DecompositionError(f"{len(points)} points of extent {size} span no volume")
     return hull
-
-
-def excess_m(mesh: trimesh.Trimesh, pieces: Iterable[trimesh.Trimesh], samples: int = 400, seed: int = 0) -> Array:
-    """How far in metres points on the pieces' surfaces stand outside ``mesh`` (0 inside), ``samples`` a piece."""
-    rng = np.random.default_rng(seed)
-    points = np.concatenate([surface_samples(piece, samples, rng)[0] for piece in pieces])
-    outside = winding_number(mesh, points) < 0.5
-    out = np.zeros(len(points))
-    out[outside] = distance_to_surface(mesh, points[outside])
-    return out
-
-
-def winding_number(mesh: trimesh.Trimesh, points: Array) -> Array:
-    """(N,) generalised winding number of points (N, 3): 1 inside a closed mesh, 0 outside.
-
-    Solid angle of a triangle by Van Oosterom and Strackee (IEEE Trans. Biomed. Eng., 1983).
-    """
-    corners = np.asarray(mesh.triangles)
-    out = np.empty(len(points))
-    for start in range(0, len(points), _CHUNK):
-        a, b, c = np.moveaxis(corners[None] - points[start : start + _CHUNK, None, None], 2, 0)
-        la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-        above = np.einsum("...i,...i->...", a, np.cross(b, c))
-        below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-        out[start : start + _CHUNK] = 2 * np.arctan2(above, below).sum(axis=1) / (4 * np.pi)
-    return out
 
 
 def _clip(polygon: Array, normal: Array, offset: float) -> Array:

@@ -15,7 +15,6 @@ DEFLECTION_MM = 0.002
 """Largest distance in mm between a curved CAD surface and its triangles."""
 ANGULAR_DEFLECTION_RAD = 0.12
 _MERGE_DIGITS = 9  # vertices that agree to a nanometre are one
-_CHUNK = 256
 
 
 class MeshError(CadError):
@@ -67,12 +66,3 @@ def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator)
     u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
     a, b, c = np.moveaxis(mesh.triangles[index], 1, 0)
     return a + u * (b - a) + v * (c - a), np.asarray(mesh.face_normals)[index]
-
-
-def distance_to_surface(mesh: trimesh.Trimesh, points: Array) -> Array:
-    """(N,) unsigned distance of points (N, 3) from the mesh's surface, in the mesh's unit."""
-    scale = 1.0 / float(np.ptp(mesh.bounds, axis=0).max())  # the tolerances in the library are absolute
-    unit = trimesh.Trimesh(scale * mesh.vertices, mesh.faces, process=False)
-    chunks = [scale * points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
-    found = [trimesh.proximity.closest_point_naive(unit, chunk)[1] for chunk in chunks]
-    return np.concatenate([np.empty(0), *found]) / scale

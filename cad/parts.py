@@ -1,7 +1,7 @@
 """A part and its folder: everything the other packages know about a part is read here.
 
-A folder holds ``part.json``, ``source.*``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces),
-``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``, ``keypoints.json``, ``grasps.json``
+A folder holds ``part.json``, ``source.*``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces) and
+``collision.json`` (their errors), ``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``, ``keypoints.json``, ``grasps.json``
 and ``preview.png``. Built-in parts live in ``cad/library``; a user's own in the folder that ``parts_dir`` or the
 environment variable ``TAGCELL_PARTS_DIR`` names.
 """
@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 from cad.equivalence import Axis, Symmetries, axis_from_json, symmetries_from_json
-from cad.spatial import Array, rotation_z, transform
+from cad.spatial import Array, diameter, rotation_z, transform
 
 LIBRARY = Path(__file__).parent / "library"
 BUILT_IN = ("inserted", "main", "top")
@@ -123,8 +123,7 @@ class Part:
     @cached_property
     def diameter_m(self) -> float:
         """Largest distance between two points of the part."""
-        v = self.mesh.convex_hull.vertices
-        return float(np.sqrt(((v[:, None] - v[None]) ** 2).sum(-1).max()))
+        return diameter(self.mesh.convex_hull.vertices)
 
     @cached_property
     def radius_m(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cad.parts import Part, StablePose
-from cad.spatial import Array, rotation_z, transform, yaw_of
+from cad.spatial import Array, angle_between, rotation_z, transform, yaw_of
 
 
 def nearest_rest(part: Part, R_table_part: Array) -> tuple[StablePose, float]:
@@ -19,7 +19,7 @@ def tilt(part: Part, pose: StablePose, R_table_part: Array) -> float:
     up = R_table_part[2]  # the table's normal in the part's frame
     target = pose.R_table_part[2]
     near = part.rest_symmetries(pose.index).nearest_direction(target, up)
-    return float(np.arctan2(np.linalg.norm(np.cross(near, target)), near @ target))
+    return float(angle_between(near, target))
 
 
 def as_rest(part: Part, pose: StablePose, T_table_part: Array) -> Array:
@@ -38,7 +38,7 @@ def as_rest(part: Part, pose: StablePose, T_table_part: Array) -> Array:
         for T in list(options)
         for axis in symmetries.continuous
     ]
-    angles = np.array([np.arccos(np.clip(T[2, :3] @ target, -1.0, 1.0)) for T in options])
+    angles = angle_between(np.array(options)[:, 2, :3], target)
     near = [T for T, angle in zip(options, angles, strict=True) if angle <= angles.min() + 1e-6]
     return min(near, key=lambda T: abs(yaw_of(T[:3, :3] @ pose.R_table_part.T)))
 

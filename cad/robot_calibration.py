@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from cad.robot import UR5E, DhTable, RobotModelError, forward_kinematics
-from cad.spatial import Array, rotation_x, rotation_z, transform
+from cad.spatial import Array, angle_between, rotation_x, rotation_z, transform
 
 MAX_SHIFT_M, MAX_TILT = 0.010, np.radians(2.0)
 """A joint axis further from the nominal arm's than this means a file of another model. Two factory files that owners
@@ -169,7 +169,7 @@ def _check_plausible(table: DhTable, nominal: DhTable) -> None:
     for i in range(1, 7):
         z, apart = ours[i, :3, 2], theirs[i, :3, 3] - ours[i, :3, 3]
         shift = float(np.linalg.norm(apart if i == 6 else apart - z * (z @ apart)))
-        tilt = float(np.arccos(np.clip(z @ theirs[i, :3, 2], -1.0, 1.0)))
+        tilt = float(angle_between(z, theirs[i, :3, 2]))
         if shift > MAX_SHIFT_M or tilt > MAX_TILT:
             what = "the flange" if i == 6 else f"the axis of joint {i + 1}"
             raise RobotModelError(

@@ -88,6 +88,11 @@ def rotation_angle(R_a: Array, R_b: Array) -> float:
     return float(np.arctan2(np.sqrt(twice_sine @ twice_sine), R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
+def angle_between(a: Array, b: Array) -> Array:
+    """Angle(s) in rad between directions (..., 3), in [0, pi] (accurate near 0 and pi, unlike acos of the product)."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+
+
 def yaw_of(R: Array) -> float:
     """The angle in rad about z that best turns the identity into ``R`` (the yaw of a rotation nearly about z)."""
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))

@@ -16,7 +16,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from cad.equivalence import Axis, Symmetries
-from cad.spatial import Array
+from cad.spatial import Array, angle_between
 from cad.symmetry import find_symmetries
 
 LEVEL_RAD = np.radians(10.0)
@@ -44,7 +44,7 @@ class RestingFace:
         images = np.einsum("sab,nb->sna", rests.elements[:, :3, :3], ups)
         if rests.continuous:
             axis = rests.continuous[0].direction
-            return np.abs(_polar(images, axis) - _polar(self.up, axis)).min(axis=0)
+            return np.abs(angle_between(images, axis) - angle_between(self.up, axis)).min(axis=0)
         apart = np.linalg.norm(images - self.up, axis=-1).min(axis=0)
         return 2 * np.arcsin(np.clip(apart / 2, 0.0, 1.0))
 
@@ -109,13 +109,8 @@ def nearest_faces(ups: Array, faces: Sequence[RestingFace], symmetries: Symmetri
 def _roll_of(up: Array, axis: Axis | None) -> Axis | None:
     if axis is None:
         return None
-    lean = float(_polar(up, axis.direction))
+    lean = float(angle_between(up, axis.direction))
     return axis if LEVEL_RAD < lean < np.pi - LEVEL_RAD else None
-
-
-def _polar(directions: Array, axis: Array) -> Array:
-    """Angle in rad (...) between unit ``directions`` (..., 3) and a unit ``axis`` (3,)."""
-    return np.arctan2(np.linalg.norm(np.cross(directions, axis), axis=-1), directions @ axis)
 
 
 def _distance(axis: Axis, point: Array) -> float:

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from cad.keypoints import KEYPOINTS, farthest_points, surface_keypoints
-from cad.meshes import distance_to_surface
+from cad.nearest import Surface
 from cad.parts import load_part
 
 
@@ -13,7 +13,7 @@ def test_the_first_keypoints_of_a_box_are_opposite_corners_and_all_lie_on_it():
     assert keypoints.shape == (KEYPOINTS, 3)
     np.testing.assert_allclose(keypoints[0] + keypoints[1], 2 * mesh.centroid, atol=1e-12)
     assert np.linalg.norm(keypoints[0] - keypoints[1]) == pytest.approx(np.linalg.norm(mesh.extents))
-    assert distance_to_surface(mesh, keypoints).max() < 1e-9
+    assert Surface(mesh).largest(keypoints) < 1e-9
     np.testing.assert_array_equal(keypoints, surface_keypoints(mesh))
 
 
@@ -35,7 +35,7 @@ def test_impossible_counts_are_refused(count):
 def test_stored_keypoints_are_those_of_the_stored_mesh(name):
     part = load_part(name)
     assert part.keypoints.shape == (KEYPOINTS, 3)
-    assert distance_to_surface(part.mesh, part.keypoints).max() < 1e-8
+    assert Surface(part.mesh).largest(part.keypoints) < 1e-8
     np.testing.assert_allclose(part.keypoints, surface_keypoints(part.mesh), atol=1e-8)
     gaps = np.linalg.norm(part.keypoints[:, None] - part.keypoints[None], axis=-1)
     assert gaps[~np.eye(KEYPOINTS, dtype=bool)].min() > 2e-3

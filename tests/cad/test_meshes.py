@@ -5,7 +5,6 @@ import trimesh
 from cad.meshes import (
     MeshError,
     check_mesh,
-    distance_to_surface,
     mesh_from_triangles,
     surface_samples,
     write_mesh,
@@ -58,10 +57,3 @@ def test_surface_samples_lie_on_the_surface_with_its_normals_and_repeat_with_the
     np.testing.assert_array_equal(points, surface_samples(mesh, 500, np.random.default_rng(3))[0])
     share = (np.abs(normals[:, 2]) > 0.5).mean()
     assert share == pytest.approx(2 * 48 / mesh.area * 1e-6, abs=0.07)
-
-
-def test_distances_are_exact_at_the_size_of_the_parts():
-    mesh = box()
-    points = np.array([[0, 0, 1.53e-3], [0, 0, 0], [5e-3, 4e-3, 0], [1e-3, 3e-3, 1.5e-3]])
-    np.testing.assert_allclose(distance_to_surface(mesh, points), [3e-5, 1.5e-3, np.sqrt(2e-6), 0], atol=1e-9)
-    assert distance_to_surface(mesh, np.empty((0, 3))).shape == (0,)

@@ -6,6 +6,7 @@ from cad.spatial import (
     BASLER,
     CAM_FROM_CAMGL,
     Intrinsics,
+    angle_between,
     apply,
     inverse,
     quat_wxyz_from_rotation,
@@ -55,6 +56,12 @@ def test_quaternions_are_wxyz_with_positive_w_and_need_no_norm(rng):
     assert (quat[:, 0] >= 0).all()
     np.testing.assert_allclose(rotation_from_quat_wxyz(3 * quat), R, atol=1e-12)
     np.testing.assert_allclose(quat_wxyz_from_rotation(np.eye(3)), [1, 0, 0, 0])
+
+
+def test_angles_between_directions_are_exact_near_zero_and_pi():
+    x = np.eye(3)[0]
+    turned = np.array([rotation_z(angle) @ x for angle in (0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi)])
+    np.testing.assert_allclose(angle_between(5 * turned, x), [0, 1e-9, 1, np.pi - 1e-9, np.pi], rtol=1e-7)
 
 
 def test_rotation_vectors_and_angles_agree(rng):
