@@ -11,7 +11,7 @@ import numpy as np
 from cad.gripper import FORCE_RANGE_N
 from cad.parts import Part
 from cad.robot import UR5E, DhTable
-from cad.spatial import BASLER, Array, Intrinsics, inverse, rotation_x, rotation_z, transform
+from cad.spatial import BASLER, Array, Intrinsics, rotation_x, rotation_z, transform
 from cad.station import BOOM_REACH_M, TRAY_SIZE_M
 from cad.tagboard import TagboardConfig
 from scenes.errors import SceneError
@@ -130,8 +130,3 @@ class CellConfig:
     def nest_frames(self, part: str) -> Array:
         """``T_world_nest`` (K, 4, 4) of a class: a part lies right in a nest at ``T_world_nest @ T_table_part``."""
         return self.T_world_tray @ self.tray.nests(part)
-
-    def in_pick_area(self, T_world_part: Array) -> bool:
-        """Whether the origin of a part (4, 4) is inside the pick area."""
-        x, y = (inverse(self.T_world_board) @ T_world_part)[:2, 3]
-        return bool(abs(x) <= self.pick_area_half_m[0] and abs(y) <= self.pick_area_half_m[1])
