@@ -30,7 +30,7 @@ class Rules:
 
     lift_m: float = 0.050
     hold_s: float = 1.0
-    hold_look_s: float = 0.002  # how often it is looked whether both pads hold a part; touches are seen at every step
+    look_s: float = 0.004  # how often all contacts are looked at, besides every step in which their number changes
     hold_gap_s: float = 0.010  # contact may flicker this long between two solver steps without ending a hold
     place_m: float = 0.3e-3
     place_rad: float = np.radians(3.0)
@@ -93,7 +93,7 @@ class Referee:
         self._lifted_z = float(config.T_world_board[2, 3]) + self._rules.lift_m
         self._nests = {p.name: config.nest_frames(p.name) for p in parts}
         self.records = [self._present(i) for i in range(len(parts))]
-        self._timestep_s, self._next_look_s = float(model.opt.timestep), -np.inf
+        self._timestep_s, self._next_look_s, self._contact_count = float(model.opt.timestep), -np.inf, -1
         self._held_since = np.full(len(parts), np.nan)
         self._held_last = np.full(len(parts), -np.inf)
         self._open = False
@@ -111,11 +111,18 @@ class Referee:
         self._touched: set[int] = set()
         self._struck: dict[str, Array] = {}
         self._lowest = (np.inf, np.zeros(3))
+        self._next_look_s = -np.inf
 
     def watch(self) -> None:
-        """Look at the contacts of the step just made."""
-        if not self._open:
+        """Look at the contacts of the step just made: when their number has changed, and from time to time.
+
+        Most steps change nothing and must cost nothing. A touch that comes and goes between two looks changes the
+        number of contacts and is seen; a hold is judged by looks less than ``hold_gap_s`` apart.
+        """
+        data = self._data
+        if not self._open or (data.ncon == self._contact_count and data.time < self._next_look_s):
             return
+        self._contact_count, self._next_look_s = data.ncon, data.time + self._rules.look_s - 0.5 * self._timestep_s
         if self._tcp_position[2] < self._lowest[0]:
             self._lowest = (float(self._tcp_position[2]), self._tcp_position.copy())
         if not self._contacts.update():
@@ -123,10 +130,8 @@ class Referee:
         self._touched |= self._contacts.touched
         for thing, point in self._contacts.strikes:
             self._strike(thing, point)
-        if self._data.time >= self._next_look_s:
-            self._next_look_s = self._data.time + self._rules.hold_look_s - 0.5 * self._timestep_s
-            for i in self._contacts.held:
-                self._hold(i)
+        for i in self._contacts.held:
+            self._hold(i)
 
     def finish(self) -> list[PartRecord]:
         """Let the world come to rest, close the last attempt and judge where every part lies."""

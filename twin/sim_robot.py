@@ -78,6 +78,7 @@ class SimRobot:
         self._qpos = np.array([j.qposadr[0] for j in joints])
         self._dofs = np.array([j.dofadr[0] for j in joints])
         self._arm_inputs = arm_inputs(model)
+        self._positions, self._ctrl = data.qpos, data.ctrl  # views, made once: they are read in every period
         self._hand = SimHand(model, data)
         self._hold_s = (self._config.control_period_s + float(model.opt.timestep)) / 2
         self._inertia, self._acceleration = np.zeros(model.nv), np.zeros(model.nv)
@@ -160,8 +161,9 @@ class SimRobot:
     def _follow(self, q: Array, qd: Array, qdd: Array, q_end: Array) -> None:
         """Run through the set points, one row (6,) a control period, and settle at ``q_end`` (6,)."""
         h = self._hold_s
-        for inputs, target in zip(np.stack([q - h * qd, qd - h * qdd, qdd], axis=1), q, strict=True):
-            self._command(inputs)
+        rows = np.stack([q - h * qd, qd - h * qdd, qdd], axis=1)
+        for inputs, target, accelerates in zip(rows, q, qdd.any(axis=1).tolist(), strict=True):
+            self._command(inputs, accelerates)
             self._period()
             self._check_tracking(target)
         self._q_target = q_end.copy()
@@ -181,28 +183,29 @@ class SimRobot:
 
     def _hold(self, q: Array) -> None:
         """Set points of the servos that hold the arm at ``q`` (6,)."""
-        self._command(np.stack([q, np.zeros(6), np.zeros(6)]))
+        self._command(np.stack([q, np.zeros(6), np.zeros(6)]), False)
 
-    def _command(self, inputs: Array) -> None:
+    def _command(self, inputs: Array, accelerates: bool) -> None:
         """Give the servos angles, speeds and accelerations (3, 6); what torque the last need is fed forward.
 
         Servos hold their set points for a whole period and follow them on average: what they get is that of its middle.
         """
-        if inputs[2].any():
+        if accelerates:
             self._acceleration[self._dofs] = inputs[2]
             mujoco.mj_mulM(self._model, self._data, self._inertia, self._acceleration)
             inputs[2] = self._inertia[self._dofs]
-        self._data.ctrl[self._arm_inputs] = inputs
+        self._ctrl[self._arm_inputs] = inputs
 
     def _period(self) -> None:
         """One control period of the hand's controller and of physics."""
         self._hand.advance(self._config.control_period_s)
-        if self.on_step is None:
-            mujoco.mj_step(self._model, self._data, self._steps)
+        model, data, step, on_step = self._model, self._data, mujoco.mj_step, self.on_step
+        if on_step is None:
+            step(model, data, self._steps)
             return
         for _ in range(self._steps):
-            mujoco.mj_step(self._model, self._data)
-            self.on_step()
+            step(model, data)
+            on_step()
 
     def _joint_spline(self, path: LinearPath) -> CubicSpline:
         """Joint angles over the share of a linear path in [0, 1]; every knot is solved before anything moves."""
@@ -234,8 +237,8 @@ class SimRobot:
         return bool(error < self._config.settle_error and speed < self._config.settle_speed)
 
     def _check_tracking(self, q: Array) -> None:
-        off = np.abs(self._data.qpos[self._qpos] - q)
-        if not off.max() <= self._config.tracking_limit:
+        off = np.abs(self._positions[self._qpos] - q)
+        if not (off <= self._config.tracking_limit).all():
             self.stop()
             raise RobotError(
                 f"protective stop: joints are {off.round(3)} rad off their path, more than "
