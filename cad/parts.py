@@ -1,9 +1,9 @@
 """A part and its folder: everything the other packages know about a part is read here.
 
 A folder holds ``part.json``, ``source.*``, ``mesh.ply`` (watertight, metres), ``hulls/*.ply`` (convex pieces) and
-``collision.json`` (their errors), ``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``, ``keypoints.json``, ``grasps.json``
-and ``preview.png``. Built-in parts live in ``cad/library``; a user's own in the folder that ``parts_dir`` or the
-environment variable ``TAGCELL_PARTS_DIR`` names.
+``collision.json`` (their errors), ``symmetries.json`` (BOP ``models_info`` form, millimetres), ``stable_poses.json``,
+``keypoints.json``, ``grasps.json`` and ``preview.png``. Built-in parts live in ``cad/library``; a user's own in the
+folder that ``parts_dir`` or the environment variable ``TAGCELL_PARTS_DIR`` names, else in the user's data directory.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ from perception.classifier import JointAnswer, JointClassifier, classify, modes
 from perception.dataset import CropSet
 from perception.faces import FaceTable
 from perception.labels import CropLabels
-from perception.posenets import PoseNets
 from perception.pvnet import PVNet, infer_votes
 from perception.verifier import PairSampler, Verifier, score_views
 from perception.voting import offset_vote, ransac_vote
@@ -117,29 +116,3 @@ def _distances(keypoints: Array, alternatives: Array) -> Array:
 
 def _overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
-
-
-def score_together(nets: PoseNets, crops: CropSet, labels: CropLabels) -> dict[str, float]:
-    """Shares of crops with a part for which the first hypothesis is right (face, and yaw within 15 degrees, up to equal
-    views) before and after V, and rejection of crops without and with a part, with the share rejected at 0.5.
-    """
-    table = nets.table
-    right: dict[str, list[bool]] = {"classifier": [], "verified": []}
-    rejected = np.zeros(len(crops), dtype=bool)
-    for i in range(0, len(crops), BATCH):
-        rows = np.arange(i, min(i + BATCH, len(crops)))
-        proposed = nets.hypotheses(crops.images[rows], labels.ray[rows])
-        verified = nets.verify(crops.images[rows], labels.ray[rows], proposed)
-        rejected[rows] = [reading.not_a_part > 0.5 for reading in verified]
-        for name, readings in (("classifier", proposed), ("verified", verified)):
-            for row, reading in zip(rows, readings, strict=True):
-                if labels.has_part[row]:
-                    h = reading.hypotheses[0]
-                    face, yaw = int(labels.face[row]), float(labels.yaw[row])
-                    found = table.index_of(h.part, h.stable_pose)
-                    right[name].append(table.same_view(face, yaw, found, h.yaw, YAW_TOLERANCE))
-    has = labels.has_part
-    return {name: float(np.mean(r)) for name, r in right.items()} | {
-        "empty_rejected": float(rejected[~has].mean()) if (~has).any() else 1.0,
-        "part_rejected": float(rejected[has].mean()),
-    }

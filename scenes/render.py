@@ -108,11 +108,6 @@ class ClassicRenderer:
             depth = self._depth(z) if "depth" in what else None
         return Rendering(rgb=rgb, instances=instances, depth_m=depth)
 
-    def upload_texture(self, name: str) -> None:
-        """Send a texture whose pixels were changed in the model to the renderer."""
-        self._gl.make_current()
-        mujoco.mjr_uploadTexture(self._model, self._context, self._model.texture(name).id)
-
     def close(self) -> None:
         """Free the context, which otherwise happens when the renderer is collected; closing twice is harmless."""
         self._free()

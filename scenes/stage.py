@@ -23,8 +23,6 @@ from scenes.render import HIDDEN_GROUP, ClassicRenderer, Rendering, What
 from scenes.shots import Placed, Shot
 
 LIGHT_DISTANCE_M = 0.5
-PLAIN_LEVEL = 205.0 / 255.0
-"""Brightness of the pick cell's plain plate."""
 
 
 @dataclass(frozen=True, kw_only=True)

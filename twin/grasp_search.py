@@ -120,7 +120,7 @@ def _closing_yaws(mesh: trimesh.Trimesh, T_table_part: Array, config: GraspConfi
     fan = [
         float(y)
         for y in np.arange(0.0, np.pi - 1e-9, config.yaw_step)
-        if all(abs((y - f + np.pi / 2) % np.pi - np.pi / 2) > _FACE_BIN for f in faces)
+        if all(_turn_between(y, f) > _FACE_BIN for f in faces)
     ]
     return sorted(faces + fan)
 
@@ -176,9 +176,13 @@ def _distinct(found: list[tuple[_Place, Grasp]], config: GraspConfig) -> list[tu
 
 
 def _alike(one: _Place, other: _Place, config: GraspConfig) -> bool:
-    turn = abs((one.yaw - other.yaw + np.pi / 2) % np.pi - np.pi / 2)
     near = abs(one.b - other.b) < config.distinct_m and abs(one.tips_m - other.tips_m) < config.distinct_m
-    return turn < config.distinct_yaw and near
+    return _turn_between(one.yaw, other.yaw) < config.distinct_yaw and near
+
+
+def _turn_between(yaw: float, other: float) -> float:
+    """Angle in rad between two closing directions, which are the same after half a turn."""
+    return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
 
 
 def _varied(found: list[tuple[_Place, Grasp]]) -> list[Grasp]:

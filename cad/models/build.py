@@ -1,4 +1,9 @@
-"""Builds the folders of the three USB Type-C parts: ``python -m cad.models.build [library]`` (extra ``cad``)."""
+"""Builds the folders of the three USB Type-C parts: ``python -m cad.models.build [library]`` (extra ``cad``).
+
+Mesh, convex pieces, symmetries and keypoints are written. Where they changed, these must follow for each part, in this
+order: ``tagcell part stable-poses NAME --drops 5000 --write`` (stable poses and grasps), ``python -m
+scenes.part_preview NAME`` (contact sheet), and training, for weights go by the parts they were made for.
+"""
 
 from __future__ import annotations
 
