@@ -20,6 +20,7 @@ from cad.parts import Part
 from cad.spatial import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from scenes.contacts import PART, Touches, make_collision, set_options
 from scenes.errors import SceneError
+from scenes.free_part import add_piece, set_mass_properties
 from scenes.gl import mujoco, rollout
 
 _CLEARANCE_M = 5e-5
@@ -148,15 +149,9 @@ def _model(part: Part, pieces: Sequence[trimesh.Trimesh], config: DropsConfig) -
     make_collision(table, Touches.CELL, PART)
     body = spec.worldbody.add_body()
     body.add_freejoint()
-    solid = part.mesh.copy()
-    solid.density = part.mass_kg / solid.volume
-    body.explicitinertial = True
-    body.mass = part.mass_kg
-    body.ipos = solid.center_mass
-    body.fullinertia = solid.moment_inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    set_mass_properties(body, part.mesh, part.mass_kg)
     for k, piece in enumerate(pieces):
-        mesh = spec.add_mesh(name=f"piece_{k}")
-        mesh.uservert = np.asarray(piece.vertices, np.float32).ravel()
-        mesh.userface = np.asarray(piece.faces, np.int32).ravel()
-        make_collision(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH.value, meshname=mesh.name), Touches.PART, PART)
+        name = f"piece_{k}"
+        add_piece(spec, name, piece)
+        make_collision(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH.value, meshname=name), Touches.PART, PART)
     return spec.compile()

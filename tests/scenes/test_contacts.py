@@ -9,6 +9,7 @@ import trimesh
 from cad.decompose import hull_of
 from cad.parts import load_part
 from scenes.contacts import PART, PLANE, Touches, make_collision, set_options
+from scenes.free_part import add_piece, set_mass_properties
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_board_scene, build_workcell
 from twin.contact_study import ContactStudyConfig, best_grasp, study_grip, study_rest
@@ -94,15 +95,11 @@ def test_round_parts_stop_rolling(pieces, radius):
     make_collision(spec.worldbody.add_geom(type=PLANE, size=[0.1, 0.1, 0.01]), Touches.LEVEL, PART)
     body = spec.worldbody.add_body(name="part", pos=[0.0, 0.0, radius], quat=[np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
     body.add_freejoint()
-    solid = trimesh.util.concatenate(pieces)
-    solid.density = 2e-4 / solid.volume
-    body.explicitinertial, body.mass, body.ipos = True, 2e-4, solid.center_mass
-    body.fullinertia = solid.moment_inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    set_mass_properties(body, trimesh.util.concatenate(pieces), 2e-4)
     for k, piece in enumerate(pieces):
-        mesh = spec.add_mesh(name=f"piece_{k}")
-        mesh.uservert = np.asarray(piece.vertices, np.float32).ravel()
-        mesh.userface = np.asarray(piece.faces, np.int32).ravel()
-        make_collision(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH.value, meshname=mesh.name), Touches.PART, PART)
+        name = f"piece_{k}"
+        add_piece(spec, name, piece)
+        make_collision(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH.value, meshname=name), Touches.PART, PART)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 300)
