@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.tables import machine
 from cad.parts import BUILT_IN, load_part
 from cad.robot import JOINT_NAMES
 from perception.estimates import Frame
@@ -178,14 +178,13 @@ def main(options: CellSpeed) -> None:
     sequence = Sequence(options)
     runs = [sequence.run() for _ in range(options.repeats)]
     best, staged = min(runs, key=lambda run: run.cpu_s), sequence.run(staged=True)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores with a load of {os.getloadavg()[0]:.1f}, Python "
-    machine += f"{platform.python_version()}, mujoco {mujoco.__version__}"
+    where = f"{machine()}; load {os.getloadavg()[0]:.1f}"
     what = (
         f"{options.parts} parts, {options.picks} picks, time step {1e3 * options.timestep_s:g} ms, seed {options.seed}"
     )
     if options.json:
         runs_json = [asdict(run) | {"factor": run.factor} for run in (*runs, staged)]
-        print(json.dumps({"machine": machine, "what": what, "factor": best.factor, "runs": runs_json}, indent=2))
+        print(json.dumps({"machine": where, "what": what, "factor": best.factor, "runs": runs_json}, indent=2))
         return
     table = Table(title=f"{best.factor:.1f} x real time on one core", title_justify="left")
     table.add_column("stage")
@@ -198,7 +197,7 @@ def main(options: CellSpeed) -> None:
     table.add_row("run with timers, wall time", f"{whole:.1f}", "100 %")
     table.add_row("best run, CPU time", f"{1e6 * best.cpu_s / best.steps:.1f}", "")
     console = Console()
-    console.print(machine, what, sep="\n")
+    console.print(where, what, sep="\n")
     console.print(table)
     console.print("all runs: " + ", ".join(f"{run.factor:.1f} x" for run in runs), highlight=False)
 

@@ -7,8 +7,6 @@ Resting depth and drift on the board, the worst of all stable poses; squeeze, cr
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,8 +15,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.tables import machine
 from cad.parts import BUILT_IN, load_part
-from scenes.gl import mujoco
 from scenes.workcell import CellConfig
 from twin.contact_study import ContactStudyConfig, best_grasp, study_grip, study_rest
 
@@ -78,10 +76,9 @@ def main(options: ContactBenchmark) -> None:
     """Measure, print, and exit with 1 when a target is missed."""
     rows = measure(options)
     missed = misses(rows)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, mujoco "
-    machine += f"{mujoco.__version__}; {options.study.pick.grip_force_n:g} N"
+    note = f"{machine()}; {options.study.pick.grip_force_n:g} N"
     if options.json:
-        print(json.dumps({"machine": machine, "rows": rows, "targets": TARGETS, "missed": missed}, indent=2))
+        print(json.dumps({"machine": note, "rows": rows, "targets": TARGETS, "missed": missed}, indent=2))
         sys.exit(bool(missed))
     table = Table()
     for name in rows[0]:
@@ -95,7 +92,7 @@ def main(options: ContactBenchmark) -> None:
         *(f"< {TARGETS[name]:g}" if name in TARGETS else "" for name in list(rows[0])[2:]),
     )
     console = Console()
-    console.print(machine, table, *missed, sep="\n")
+    console.print(note, table, *missed, sep="\n")
     sys.exit(bool(missed))
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
 
 from scenes.gl import mujoco
+
+_FILE_WIDTH = 160  # columns, so that nothing is cut in a file or a pipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,7 @@ def show(sections: list[Section], note: str, *, as_json: bool) -> None:
         tables = {s.title: [dict(zip(s.columns, row, strict=True)) for row in s.rows] for s in sections}
         print(json.dumps({"machine": machine(), "note": note, "tables": tables}, indent=2))
         return
-    console = Console()
+    console = Console() if sys.stdout.isatty() else Console(width=_FILE_WIDTH)
     for section in sections:
         table = Table(*section.columns, title=section.title, title_justify="left")
         for row in section.rows:
