@@ -16,7 +16,7 @@ ESTIMATOR ?= learned
 
 help:
 	@sed -n 's/^#   //p' Makefile
-	@echo "also: make setup, test-slow (the long tests), format, cad (rebuild the CAD; installs build123d), clean"
+	@echo "also: make setup, test-slow (the long tests), format, cad (rebuild parts and samples; installs build123d), clean"
 	@echo "variables: OUT=$(OUT) SCENES=$(SCENES) SEED=$(SEED) ESTIMATOR=$(ESTIMATOR) PYTHON=$(PYTHON)"
 
 $(READY): pyproject.toml constraints.txt
