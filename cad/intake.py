@@ -135,7 +135,7 @@ def _check_size(name: str, soups: list[Soup], unit: str, accept: bool, config: I
     others = {other: size * factor / METRES_PER_UNIT.get(unit, 1e-3) for other, factor in METRES_PER_UNIT.items()}
     listed = ", ".join(f"{_mm(value)} if they are {key}" for key, value in others.items() if key not in (unit, "ft"))
     fitting = [other for other, value in others.items() if low <= value <= high and other != unit]
-    hint = f"--unit {fitting[0]}" if len(fitting) == 1 else f"--unit {'|'.join(METRES_PER_UNIT)}"
+    hint = f"--unit {'|'.join(fitting or METRES_PER_UNIT)}"
     raise MeshError(
         f"{name} is {_mm(size)} long if its numbers are {unit}, but this cell picks parts of {low:g} to {high:g} mm; "
         f"which unit is it ({listed})? Answer with {hint}, or with --accept-size if {_mm(size)} is right"

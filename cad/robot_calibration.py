@@ -39,8 +39,10 @@ def read_dh_calibration(path: Path, nominal: DhTable = UR5E) -> DhTable:
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationFileError(f"{path} cannot be read: {error}") from error
+    except OSError as error:
+        raise CalibrationFileError(f"{path} cannot be read: {error.strerror}; name the arm's own file") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationFileError(f"{path} cannot be read: it is no text file; name the arm's own file") from error
     is_ros = Path(path).suffix.lower() in (".yaml", ".yml")
     try:
         table = _from_ros(text) if is_ros else _from_controller(text, nominal)
@@ -92,13 +94,17 @@ def _dh_row(T_base_previous: Array, T_base_frame: Array) -> tuple[float, float, 
     return float(theta), float(T[2, 3]), float(T[:2, 3] @ [np.cos(theta), np.sin(theta)]), float(alpha)
 
 
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
 def _from_controller(text: str, nominal: DhTable) -> DhTable:
     """``calibration.conf``: deltas that are added to the nominal table, in its section ``[mounting]``."""
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
     try:
         parser.read_string(text)
     except configparser.Error as error:
-        raise CalibrationFileError(f"it is no INI file as a UR controller writes it: {error}") from error
+        raise CalibrationFileError(f"it is no INI file as a UR controller writes it: {_in_one_line(error)}") from error
     if not parser.has_section("mounting"):
         raise CalibrationFileError(f"it has no section [mounting]; its sections are {parser.sections()}")
     section = parser["mounting"]
@@ -139,7 +145,7 @@ def _from_ros(text: str) -> DhTable:
     try:
         document = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise CalibrationFileError(f"it is no YAML file: {error}") from error
+        raise CalibrationFileError(f"it is no YAML file: {_in_one_line(error)}") from error
     links = document.get("kinematics") if isinstance(document, dict) else None
     if not isinstance(links, dict):
         raise CalibrationFileError("it has no mapping 'kinematics' as ROS's ur_calibration writes it")

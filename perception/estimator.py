@@ -91,7 +91,8 @@ class LearnedEstimator:
             if name not in known:
                 raise PerceptionError(
                     f"the weights in {folder} know {', '.join(known)} but not {name!r}; parts there are: "
-                    f"{', '.join(all_part_names(parts_dir))}. Train with `tagcell train`"
+                    f"{', '.join(all_part_names(parts_dir))}. Use weights that were trained on {name!r}, or pick it "
+                    "with `--estimator oracle`"
                 )
 
     def estimate(self, frame: Frame) -> FrameEstimate:

@@ -160,8 +160,8 @@ def main(arguments: list[str] | None = None) -> Any:
     )
     try:
         verb.run()
-    except KeyboardInterrupt:
-        print("\ntagcell: stopped; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"\ntagcell: stopped; {str(stop) or 'what was finished is kept'}", file=sys.stderr)
         sys.exit(130)
     except (CadError, PerceptionError, SceneError, TwinError, OSError) as error:
         print(f"tagcell: {error}", file=sys.stderr)

@@ -61,6 +61,8 @@ class NewPartConfig:
         for flag, value in (("--mass-g", self.mass_g), ("--density", self.density)):
             if value is not None and not 0 < value < float("inf"):
                 raise NewPartError(f"{flag} {value}: it must be positive")
+        if self.seed < 0:
+            raise NewPartError(f"--seed {self.seed}: it must not be negative")
         if self.drops < 1000:
             raise NewPartError(f"--drops {self.drops}: at least 1000 are needed for the probabilities")
 

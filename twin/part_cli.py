@@ -21,7 +21,8 @@ Unit = Literal["mm", "cm", "m", "um", "in", "ft"]
 @contextmanager
 def progress_bar(name: str) -> Iterator[Callable[[float], None]]:
     """A bar on standard error; yields what is to be told the share (0 to 1) that is done."""
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(name, total=1.0)
         yield lambda share: progress.update(task, completed=share)
 
@@ -105,7 +106,10 @@ class PartAdd:
                 if not console.is_terminal:
                     console.print(stage, highlight=False)
 
-            added = add_part(config, report)
+            try:
+                added = add_part(config, report)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt("no part was added") from None
         if self.json:
             taken = {"notes": added.intake.notes, "seconds": added.seconds}
             print(json.dumps(describe_part(added.part) | taken, indent=1))
@@ -144,14 +148,15 @@ class PartStablePoses:
         """Drop the part and print, plot and save what came of it."""
         from scenes.stable_poses import StablePoseConfig
         from twin.grasps import write_grasps
-        from twin.scorecard import write_json
+        from twin.scorecard import check_writable, write_json
         from twin.stable_pose_plot import plot_stable_poses
         from twin.stable_pose_report import print_stable_poses, stable_pose_report
 
         part = load_part(self.name, self.parts_dir)
+        config = StablePoseConfig(drops=self.drops, seed=self.seed)
+        check_writable(self.out)
         with progress_bar(f"dropping {self.name}") as advance:
-            report = stable_pose_report(part, StablePoseConfig(drops=self.drops, seed=self.seed), advance)
-        self.out.mkdir(parents=True, exist_ok=True)
+            report = stable_pose_report(part, config, advance)
         document, plot = report.as_json(), self.out / f"{self.name}.png"
         write_json(self.out / f"{self.name}.json", document)
         plot_stable_poses(report, plot)

@@ -66,8 +66,9 @@ def print_part(part: Part, *, as_json: bool) -> None:
     shapes = read_collision(part.folder)
     if shapes is not None:
         r = shapes.report
+        pieces = f"{r.pieces} convex piece{'s' * (r.pieces > 1)} ({r.method})"
         console.print(
-            f"collision shapes: {r.pieces} convex pieces ({r.method}), at most {r.excess_max_um:.1f} um proud "
+            f"collision shapes: {pieces}, at most {r.excess_max_um:.1f} um proud "
             f"({r.excess_mm3:.4f} mm3), {r.missing_max_um:.1f} um short ({r.missing_mm3:.4f} mm3)"
         )
     console.print(f"mesh {part.mesh_hash}; {part.folder}", soft_wrap=True)

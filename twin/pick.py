@@ -6,7 +6,6 @@ import dataclasses
 import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from pathlib import Path
 from typing import Any
 
 from cad.parts import Part, hash_file, load_part
@@ -17,8 +16,7 @@ from scenes.cell_config import CellConfig, TrayConfig
 from twin.doctor import versions
 from twin.pick_config import PickConfig
 from twin.report import ScenesProgress
-from twin.robot import TwinError
-from twin.scorecard import SceneResult, build_scorecard, write_json
+from twin.scorecard import SceneResult, build_scorecard, check_writable, write_json
 
 
 def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
@@ -26,7 +24,7 @@ def run_pick(config: PickConfig, *, quiet: bool = False) -> dict[str, Any]:
 
     Raises TwinError when ``out`` cannot be written and PerceptionError when weights are missing, before any scene runs.
     """
-    _check_writable(config.out)
+    check_writable(config.out)
     parts = {name: load_part(name, config.parts_dir) for name in config.parts}
     cell_for(config)
     weights = check_weights(config)
@@ -129,13 +127,3 @@ def _run_scenes(config: PickConfig) -> Iterator[SceneResult]:
 
 def _views_differ(part: Part) -> bool:
     return len({p.view_class for p in part.stable_poses}) == len(part.stable_poses)
-
-
-def _check_writable(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".tagcell"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise TwinError(f"cannot write to {out} ({error.strerror}); choose another folder with --out") from error

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
+from twin.robot import TwinError
+
 FAILURES = ("detection", "declined", "pose", "ik", "grasp", "transport", "place", "disturbed", "collision")
 
 
@@ -141,6 +143,17 @@ def build_scorecard(
         **about,
         "parts": [asdict(p) for p in parts],
     }
+
+
+def check_writable(out: Path) -> None:
+    """Make the folder ``out``; raises TwinError, naming --out, where nothing can be written to it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".tagcell"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise TwinError(f"cannot write to {out} ({error.strerror}); choose another folder with --out") from error
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -153,7 +153,7 @@ def test_unusable_files_are_refused_in_one_line(name, text, says, tmp_path):
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibrationFileError, match=says) as caught:
         read_dh_calibration(tmp_path / name)
-    assert str(tmp_path / name) in str(caught.value)
+    assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -89,6 +89,22 @@ def test_parts_are_listed_for_people_and_machines(capsys):
     assert "main" in text and "stable poses" in text
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (["--out", "FILE/out"], "choose another folder with --out"),
+        (["--seed", "-1"], "seed -1"),
+        (["--drops", "0"], "drops 0"),
+    ],
+)
+def test_stable_poses_refuse_before_any_drop(capsys, tmp_path, monkeypatch, changes, said):
+    monkeypatch.setattr("twin.stable_pose_report.stable_pose_report", lambda *_: pytest.fail("parts were dropped"))
+    (tmp_path / "file").touch()
+    words = [word.replace("FILE", str(tmp_path / "file")) for word in changes]
+    code, text = fails(capsys, "part", "stable-poses", "main", "--out", str(tmp_path / "out"), *words)
+    assert code == 1 and text.startswith("tagcell: ") and said in text
+
+
 def test_help_shows_every_verb(capsys):
     code, text = fails(capsys, "--help")
     assert code == 0

@@ -91,14 +91,16 @@ def test_a_weighed_part_has_its_mass_and_keeps_its_number_when_replaced(tmp_path
         load_part("block", config.parts_dir)
 
 
-def test_a_stopped_run_leaves_nothing_behind(tmp_path, monkeypatch):
+def test_a_stopped_run_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(new_part, "stable_pose_report", stop)
-    config = NewPartConfig(file=block(tmp_path / "block.stl"), name="block", parts_dir=tmp_path / "own")
-    with pytest.raises(KeyboardInterrupt):
-        add_part(config)
+    file = block(tmp_path / "block.stl")
+    with pytest.raises(SystemExit) as stopped:
+        main(["part", "add", str(file), "--name", "block", "--parts-dir", str(tmp_path / "own")])
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.endswith("tagcell: stopped; no part was added\n")
     assert list((tmp_path / "own").iterdir()) == []
 
 
@@ -120,6 +122,7 @@ def test_what_a_killed_run_left_is_swept_away(tmp_path):
         (["FILE", "--name", "x", "--mass-g", "1", "--density", "2"], "one of them"),
         (["FILE", "--name", "x", "--mass-g", "-1"], "must be positive"),
         (["FILE", "--name", "x", "--unit", "m"], "--accept-size"),
+        (["FILE", "--name", "x", "--seed", "-1"], "--seed -1"),
     ],
 )
 def test_wrong_input_is_one_line_and_leaves_nothing(capsys, tmp_path, arguments, said):
