@@ -80,7 +80,7 @@ def test_a_convex_part_is_its_own_hull(mesh):
     assert shapes.pieces[0].volume == pytest.approx(mesh.volume, rel=1e-6)
 
 
-@pytest.mark.parametrize("make", [channel, ring])
+@pytest.mark.parametrize("make", [channel, pytest.param(ring, marks=pytest.mark.slow)])
 def test_other_parts_are_decomposed_and_lie_as_their_hull_does(make):
     mesh = make()
     shapes = find_collision_shapes(mesh, CollisionConfig(thresholds=(0.1, 0.05), max_excess_m=0.15e-3))

@@ -27,47 +27,47 @@ def block(path: Path, sides_mm: tuple[float, float, float] = (6.0, 5.0, 3.0)) ->
 
 
 @pytest.fixture(scope="module")
-def nut(tmp_path_factory):
+def brick(tmp_path_factory):
     root = tmp_path_factory.mktemp("own")
     stages: list[str] = []
-    config = NewPartConfig(file=EXAMPLES / "hex_nut.step", name="nut", parts_dir=root, drops=1000)
+    config = NewPartConfig(file=block(root.parent / "brick.STL"), name="brick", parts_dir=root, drops=1000)
     return root, add_part(config, stages.append), stages
 
 
-def test_a_step_file_becomes_a_whole_part(nut):
-    root, added, stages = nut
-    assert sorted(p.name for p in root.iterdir() if p.is_dir()) == ["nut"]
-    for file in (*FILES, "grasps.json", "preview.png", "source.step"):
-        assert (root / "nut" / file).is_file(), file
+def test_a_file_becomes_a_whole_part(brick):
+    root, added, stages = brick
+    assert sorted(p.name for p in root.iterdir() if p.is_dir()) == ["brick"]
+    for file in (*FILES, "grasps.json", "preview.png", "source.stl"):
+        assert (root / "brick" / file).is_file(), file
     assert list(added.seconds) == stages
-    part = load_part("nut", root)
+    part = load_part("brick", root)
     assert part.obj_id == 1 + max(load_part(name).obj_id for name in BUILT_IN)
-    assert part_names(root) == [*BUILT_IN, "nut"]
-    assert len(part.symmetries.elements) == 12
+    assert part_names(root) == [*BUILT_IN, "brick"]
+    assert len(part.symmetries.elements) == 4
     assert part.keypoints.shape == (8, 3)
     assert part.mass_kg == pytest.approx(part.mesh.volume * MATERIALS["steel"].density_kg_m3)
     assert sum(pose.probability for pose in part.stable_poses) > 0.995
 
 
-def test_every_pose_of_a_nut_can_be_gripped_or_says_why(nut):
-    _, added, _ = nut
-    flat = added.part.stable_poses[0]
-    assert any(grasp["stable_pose"] == flat.index for grasp in added.part.grasps)
+def test_every_pose_of_a_brick_can_be_gripped(brick):
+    _, added, _ = brick
+    assert {grasp["stable_pose"] for grasp in added.part.grasps} == {pose.index for pose in added.part.stable_poses}
 
 
-def test_a_name_is_taken_once_and_replaced_on_demand(nut, tmp_path):
-    root, added, _ = nut
-    config = {"file": EXAMPLES / "hex_nut.step", "name": "nut", "parts_dir": root, "drops": 1000}
+def test_a_failing_run_leaves_the_part_of_that_name_as_it_was(brick, tmp_path):
+    root, added, _ = brick
+    config = {"file": EXAMPLES / "hex_nut.step", "name": "brick", "parts_dir": root, "drops": 1000}
     with pytest.raises(NewPartError, match="--replace"):
         add_part(NewPartConfig(**config))
     broken = tmp_path / "broken.step"
     broken.write_text("ISO-10303-21;")
     with pytest.raises(MeshError):
         add_part(NewPartConfig(**config | {"file": broken, "replace": True}))
-    assert load_part("nut", root).mesh_hash == added.part.mesh_hash
+    assert load_part("brick", root).mesh_hash == added.part.mesh_hash
 
 
-def test_a_weighed_part_has_its_mass_and_keeps_its_number_when_replaced(tmp_path):
+def test_a_weighed_part_has_its_mass_and_keeps_its_number_when_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(new_part, "write_grasps", lambda part: None)
     file = block(tmp_path / "block.stl")
     config = NewPartConfig(file=file, name="block", mass_g=0.5, parts_dir=tmp_path / "own", drops=1000)
     first = add_part(config).part
@@ -89,6 +89,16 @@ def test_a_weighed_part_has_its_mass_and_keeps_its_number_when_replaced(tmp_path
     assert not gone.exists() and part_names(config.parts_dir) == list(BUILT_IN)
     with pytest.raises(PartError, match="block"):
         load_part("block", config.parts_dir)
+
+
+def test_a_part_without_grasps_is_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(new_part, "write_grasps", lambda part: None)
+    file, where = block(tmp_path / "block.stl"), ["--parts-dir", str(tmp_path / "own")]
+    main(["part", "add", str(file), "--name", "block", "--drops", "1000", *where])
+    assert "1 convex piece (hull)" in capsys.readouterr().out
+    main(["part", "show", "block", "--json", *where])
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["grasps"] == 0 and [pose["grasps"] for pose in shown["stable_poses"]] == [0, 0, 0]
 
 
 def test_a_stopped_run_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
@@ -161,6 +171,7 @@ def test_a_new_part_is_picked_by_the_oracle(tmp_path, capsys, name):
     capsys.readouterr()
     main(["pick", "--parts", name, "--estimator", "oracle", "--scenes", "4", "--parts-per-class", "3", *common])
     card = json.loads(capsys.readouterr().out)
+    assert (tmp_path / name / "source.step").is_file()
     gripped = {grasp["stable_pose"] for grasp in load_part(name, tmp_path).grasps}
     share = sum(p.probability for p in load_part(name, tmp_path).stable_poses if p.index in gripped)
     assert card["picks"]["success_rate"] >= np.floor(12 * share * 0.9) / 12
