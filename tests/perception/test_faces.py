@@ -1,40 +1,15 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from made_parts import part_of
 
-from cad.equivalence import Symmetries
-from cad.parts import Part, StablePose
+from cad.parts import Part
 from cad.spatial import rotation_x, rotation_y, rotation_z
 from perception.estimates import PerceptionError
 from perception.faces import FaceTable
 from perception.view_equivalence import find_view_equivalents
-
-
-def part_of(mesh: trimesh.Trimesh, rotations, name: str = "block", obj_id: int = 1) -> Part:
-    poses = []
-    for i, R in enumerate(rotations):
-        v = mesh.vertices @ np.asarray(R).T
-        t = -(v.min(axis=0) + v.max(axis=0)) / 2
-        t[2] = -v[:, 2].min()
-        poses.append(StablePose(index=i, R_table_part=R, t_table_part=t, probability=1 / len(rotations), view_class=i))
-    return Part(
-        name=name,
-        obj_id=obj_id,
-        folder=Path(),
-        mass_kg=1e-4,
-        material="steel",
-        rgba=(1.0, 1.0, 1.0, 1.0),
-        metallic=0.0,
-        roughness=1.0,
-        mesh=mesh,
-        symmetries=Symmetries(),
-        stable_poses=tuple(poses),
-        keypoints=np.asarray(mesh.vertices[:8]),
-        mesh_hash="",
-    )
 
 
 def viewed(part: Part) -> Part:
@@ -52,7 +27,8 @@ def brick() -> Part:
 def ell() -> Part:
     long, short = trimesh.creation.box([8e-3, 3e-3, 2e-3]), trimesh.creation.box([2e-3, 6e-3, 2e-3])
     short.apply_translation([-3e-3, 3e-3, 0.0])
-    return viewed(part_of(trimesh.util.concatenate([long, short]), [np.eye(3), rotation_x(np.pi)], "ell", 2))
+    ell = trimesh.util.concatenate([long, short])
+    return viewed(part_of(ell, [np.eye(3), rotation_x(np.pi)], name="ell", obj_id=2))
 
 
 def test_equivalence_goes_both_ways() -> None:

@@ -1,39 +1,15 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from made_parts import part_of
 
 from cad.equivalence import Symmetries
-from cad.parts import Part, StablePose, planar
+from cad.parts import Part, planar
 from cad.spatial import apply, rotation_x, rotation_y, rotation_z, wrap_angle
 from cad.symmetry import find_symmetries
 from perception.view_equivalence import find_view_equivalents, top_view, view_difference_mm2
-
-
-def part_of(mesh: trimesh.Trimesh, rotations, symmetries: Symmetries | None = None) -> Part:
-    poses = []
-    for i, R in enumerate(rotations):
-        v = mesh.vertices @ np.asarray(R).T
-        t = -(v.min(axis=0) + v.max(axis=0)) / 2
-        t[2] = -v[:, 2].min()
-        poses.append(StablePose(index=i, R_table_part=R, t_table_part=t, probability=1 / len(rotations), view_class=i))
-    return Part(
-        name="solid",
-        obj_id=1,
-        folder=Path(),
-        mass_kg=1e-4,
-        material="steel",
-        rgba=(1.0, 1.0, 1.0, 1.0),
-        metallic=0.0,
-        roughness=1.0,
-        mesh=mesh,
-        symmetries=symmetries or Symmetries(),
-        stable_poses=tuple(poses),
-        keypoints=np.asarray(mesh.vertices[:8]),
-        mesh_hash="",
-    )
 
 
 def prism(sides: int, across: float = 4e-3, height: float = 1.6e-3) -> trimesh.Trimesh:
