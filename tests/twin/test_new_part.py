@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -91,12 +92,13 @@ def test_a_weighed_part_has_its_mass_and_keeps_its_number_when_replaced(tmp_path
         load_part("block", config.parts_dir)
 
 
-def test_a_part_without_grasps_is_shown(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(new_part, "write_grasps", lambda part: None)
-    file, where = block(tmp_path / "block.stl"), ["--parts-dir", str(tmp_path / "own")]
-    main(["part", "add", str(file), "--name", "block", "--drops", "1000", *where])
-    assert "1 convex piece (hull)" in capsys.readouterr().out
-    main(["part", "show", "block", "--json", *where])
+def test_a_part_without_grasps_is_shown(brick, tmp_path, capsys):
+    shutil.copytree(brick[0] / "brick", tmp_path / "brick")
+    (tmp_path / "brick" / "grasps.json").unlink()
+    main(["part", "show", "brick", "--parts-dir", str(tmp_path)])
+    text = capsys.readouterr().out
+    assert "1 convex piece (hull)" in text and text.count("none") == 3
+    main(["part", "show", "brick", "--parts-dir", str(tmp_path), "--json"])
     shown = json.loads(capsys.readouterr().out)
     assert shown["grasps"] == 0 and [pose["grasps"] for pose in shown["stable_poses"]] == [0, 0, 0]
 
