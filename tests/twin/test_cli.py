@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from cad.parts import part_names
+from twin.__main__ import main as start
 from twin.cli import main
 
 
@@ -103,6 +104,32 @@ def test_stable_poses_refuse_before_any_drop(capsys, tmp_path, monkeypatch, chan
     words = [word.replace("FILE", str(tmp_path / "file")) for word in changes]
     code, text = fails(capsys, "part", "stable-poses", "main", "--out", str(tmp_path / "out"), *words)
     assert code == 1 and text.startswith("tagcell: ") and said in text
+
+
+def test_ctrl_c_before_a_verb_runs_ends_in_one_line(capsys, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("twin.cli.tyro.cli", stop)
+    with pytest.raises(SystemExit) as stopped:
+        start()
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.strip() == "tagcell: stopped"
+
+
+def test_ctrl_c_while_packages_are_imported_ends_in_one_line():
+    code = """
+import signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "twin.cli":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from twin.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.strip()) == (130, "tagcell: stopped")
 
 
 def test_help_shows_every_verb(capsys):
