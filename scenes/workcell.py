@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 
 from cad.collision import contact_pieces
 from cad.parts import LIBRARY, Part, load_mesh, load_part
@@ -16,6 +15,7 @@ from scenes.arm import add_arm
 from scenes.camera import add_camera
 from scenes.cell_config import CellConfig, TrayConfig
 from scenes.contacts import BOX, PART, PLANE, ROBOT, Touches, add_primitive, make_collision, set_options
+from scenes.free_part import add_piece, set_mass_properties
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_part_material, add_visual, classic_finish
 from scenes.randomize import DEFAULT_AMBIENT, DEFAULT_LAMPS
@@ -80,7 +80,7 @@ def _add_parts(spec: mujoco.MjSpec, config: CellConfig, part_names: Sequence[str
         add_mesh(spec, f"{part.name}_visual", part.mesh)
         add_part_material(spec, part.name, part)
         for k, hull in enumerate(contact_pieces(part, "grasp")):
-            _add_hull(spec, f"{part.name}_hull_{k:02d}", hull)
+            add_piece(spec, f"{part.name}_hull_{k:02d}", hull)
     for i, name in enumerate(part_names):
         _add_part(spec, i, parts[name])
 
@@ -157,24 +157,12 @@ def _add_overview(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _add_hull(spec: mujoco.MjSpec, name: str, hull: trimesh.Trimesh) -> None:
-    mesh = spec.add_mesh(name=name)
-    mesh.uservert = np.asarray(hull.vertices, np.float32).ravel()
-    mesh.userface = np.asarray(hull.faces, np.int32).ravel()
-
-
 def _add_part(spec: mujoco.MjSpec, index: int, part: Part) -> None:
     """A free body: mass and inertia of the part's mesh, convex pieces for contact, the mesh to look at."""
     name = part_body(index)
     body = spec.worldbody.add_body(name=name, pos=[-0.3 - 0.02 * index, -0.5, 0.02])
     body.add_freejoint(name=name)
-    solid = part.mesh.copy()
-    solid.density = part.mass_kg / solid.volume
-    inertia = solid.moment_inertia
-    body.explicitinertial = True
-    body.mass = part.mass_kg
-    body.ipos = solid.center_mass
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    set_mass_properties(body, part.mesh, part.mass_kg)
     add_visual(body, f"{name}_visual", f"{part.name}_visual", material=part.name)
     for k in range(len(contact_pieces(part, "grasp"))):
         geom = body.add_geom(

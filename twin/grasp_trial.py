@@ -31,7 +31,8 @@ class TrialConfig:
 
     The part is lifted by ``lift_m``, carried over ``carry_m`` with a ``turn`` on the way, accelerated as the
     controller's fastest carries accelerate the tool, and put down. It may slip by the ``tolerance`` and lie off by as
-    much, the referee's for a placed part. ``offsets`` are the errors of the hand that the best grasps are tried with.
+    much, half of what the referee allows a placed part. ``offsets`` are the errors of the hand that the best grasps are
+    tried with.
     """
 
     lift_m: float = 0.060
@@ -41,8 +42,8 @@ class TrialConfig:
     hold_s: float = 0.05
     settle_s: float = 0.10
     above_m: float = 1.0e-3
-    tolerance_m: float = 0.3e-3
-    tolerance_rad: float = np.deg2rad(3.0)
+    tolerance_m: float = 0.15e-3
+    tolerance_rad: float = np.deg2rad(1.5)
     pad_friction: float = gripper.PAD_FRICTION
     grip_limit_s: float = 1.0
     grip_rest_s: float = 0.02

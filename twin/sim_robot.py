@@ -162,8 +162,8 @@ class SimRobot:
         """Run through the set points, one row (6,) a control period, and settle at ``q_end`` (6,)."""
         h = self._hold_s
         rows = np.stack([q - h * qd, qd - h * qdd, qdd], axis=1)
-        for inputs, target, accelerates in zip(rows, q, qdd.any(axis=1).tolist(), strict=True):
-            self._command(inputs, accelerates)
+        for inputs, target in zip(rows, q, strict=True):
+            self._command(inputs)
             self._period()
             self._check_tracking(target)
         self._q_target = q_end.copy()
@@ -183,14 +183,14 @@ class SimRobot:
 
     def _hold(self, q: Array) -> None:
         """Set points of the servos that hold the arm at ``q`` (6,)."""
-        self._command(np.stack([q, np.zeros(6), np.zeros(6)]), False)
+        self._command(np.stack([q, np.zeros(6), np.zeros(6)]))
 
-    def _command(self, inputs: Array, accelerates: bool) -> None:
+    def _command(self, inputs: Array) -> None:
         """Give the servos angles, speeds and accelerations (3, 6); what torque the last need is fed forward.
 
         Servos hold their set points for a whole period and follow them on average: what they get is that of its middle.
         """
-        if accelerates:
+        if inputs[2].any():
             self._acceleration[self._dofs] = inputs[2]
             mujoco.mj_mulM(self._model, self._data, self._inertia, self._acceleration)
             inputs[2] = self._inertia[self._dofs]
