@@ -75,25 +75,25 @@ class SimRobot:
         self.ik = ArmIk(arm.compile(), q_home)
         self._kinematics = ArmIk(arm.compile(), q_home, IkConfig(joint_window=4 * np.pi))
         joints = [model.joint(name) for name in robot.JOINT_NAMES]
-        self._qpos = np.array([j.qposadr[0] for j in joints])
-        self._dofs = np.array([j.dofadr[0] for j in joints])
-        self._arm_inputs = arm_inputs(model)
-        self._positions, self._ctrl = data.qpos, data.ctrl  # views, made once: they are read in every period
+        # views of the arm's entries, made once: they are read in every control period
+        self._dofs = _run(np.array([j.dofadr[0] for j in joints]))
+        self._q, self._qd = data.qpos[_run(np.array([j.qposadr[0] for j in joints]))], data.qvel[self._dofs]
+        self._servos = data.ctrl[_run(arm_inputs(model).T)].reshape(6, 3).T
         self._hand = SimHand(model, data)
         self._hold_s = (self._config.control_period_s + float(model.opt.timestep)) / 2
-        self._inertia, self._acceleration = np.zeros(model.nv), np.zeros(model.nv)
-        self._q_target = data.qpos[self._qpos].copy()
+        self._inertia, self._acceleration, self._off = np.zeros(model.nv), np.zeros(model.nv), np.zeros(6)
+        self._q_target = self._q.copy()
         self._hold(self._q_target)
 
     # -- Robot ----------------------------------------------------------------------------------------------------
 
     def observe(self) -> RobotState:
         """The latest measured state."""
-        q = self._data.qpos[self._qpos].copy()
+        q = self._q.copy()
         return RobotState(
             time_s=float(self._data.time),
             q=q,
-            qd=self._data.qvel[self._dofs].copy(),
+            qd=self._qd.copy(),
             T_base_tcp=self._kinematics.forward(q),
             opening_m=self._hand.opening_m,
             grip=self._hand.state,
@@ -147,7 +147,7 @@ class SimRobot:
 
     def stop(self) -> None:
         """Stop all motion now: the arm holds where it is, and so do fingers that are not gripping anything."""
-        self._q_target = self._data.qpos[self._qpos].copy()
+        self._q_target = self._q.copy()
         self._hold(self._q_target)
         self._hand.stop()
 
@@ -171,7 +171,7 @@ class SimRobot:
         waited_s = 0.0
         while not self._settled(q_end):
             if waited_s > self._config.settle_limit_s:
-                error = np.abs(self._data.qpos[self._qpos] - q_end).max()
+                error = np.abs(self._q - q_end).max()
                 self.stop()
                 raise RobotError(
                     f"the arm did not settle within {self._config.settle_limit_s} s: a joint is still {error:.2e} rad "
@@ -194,7 +194,7 @@ class SimRobot:
             self._acceleration[self._dofs] = inputs[2]
             mujoco.mj_mulM(self._model, self._data, self._inertia, self._acceleration)
             inputs[2] = self._inertia[self._dofs]
-        self._ctrl[self._arm_inputs] = inputs
+        self._servos[...] = inputs
 
     def _period(self) -> None:
         """One control period of the hand's controller and of physics."""
@@ -232,13 +232,13 @@ class SimRobot:
     # -- checks ---------------------------------------------------------------------------------------------------
 
     def _settled(self, q_end: Array) -> bool:
-        error = np.abs(self._data.qpos[self._qpos] - q_end).max()
-        speed = np.abs(self._data.qvel[self._dofs]).max()
+        error = np.abs(self._q - q_end).max()
+        speed = np.abs(self._qd).max()
         return bool(error < self._config.settle_error and speed < self._config.settle_speed)
 
     def _check_tracking(self, q: Array) -> None:
-        off = np.abs(self._positions[self._qpos] - q)
-        if not (off <= self._config.tracking_limit).all():
+        off = np.subtract(self._q, q, out=self._off)
+        if not np.abs(off, out=off).max() <= self._config.tracking_limit:
             self.stop()
             raise RobotError(
                 f"protective stop: joints are {off.round(3)} rad off their path, more than "
@@ -271,6 +271,14 @@ class SimRobot:
                 f"move refused: it would bring the TCP to z = {1e3 * z:.2f} mm, below the table at "
                 f"{1e3 * self._config.min_tcp_z_m:.2f} mm"
             )
+
+
+def _run(indices: Array) -> slice:
+    """The slice of an array that indices following each other stand for; a slice's view is never made again."""
+    first, count = int(indices.flat[0]), indices.size
+    if not np.array_equal(indices.ravel(), np.arange(first, first + count)):
+        raise ValueError(f"the arm's entries {indices.ravel().tolist()} do not follow each other in the model")
+    return slice(first, first + count)
 
 
 def _check_rates(what: str, speed: float, max_speed: float, acceleration: float, max_acceleration: float) -> None:
