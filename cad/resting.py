@@ -10,8 +10,9 @@ from cad.spatial import Array, angle_between, rotation_z, transform, yaw_of
 
 def nearest_rest(part: Part, R_table_part: Array) -> tuple[StablePose, float]:
     """The stable pose that ``R_table_part`` (3, 3) is nearest to, and how far it leans from it in rad."""
-    best = min(part.stable_poses, key=lambda pose: tilt(part, pose, R_table_part))
-    return best, tilt(part, best, R_table_part)
+    tilts = [tilt(part, pose, R_table_part) for pose in part.stable_poses]
+    best = int(np.argmin(tilts))
+    return part.stable_poses[best], tilts[best]
 
 
 def tilt(part: Part, pose: StablePose, R_table_part: Array) -> float:

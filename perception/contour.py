@@ -87,26 +87,6 @@ class Refinement:
     explained: float
 
 
-def refine(
-    image: NDArray[np.uint8] | Image32 | EdgeImage,
-    intrinsics: Intrinsics,
-    part: Part,
-    stable_pose: int,
-    T_cam_table: Array,
-    x: float,
-    y: float,
-    yaw: float,
-    config: ContourConfig | None = None,
-) -> Refinement:
-    """Lay the contour of a part resting on ``stable_pose`` on a gray crop (H, W), or its EdgeImage, near (x, y, yaw).
-
-    ``intrinsics`` are the crop's at its own resolution, ``T_cam_table`` (4, 4). Finds contours within the grid of the
-    config, at full resolution 8 pixels and 5 degrees. Always returns the best fit found: the caller judges it by its
-    scores, since a covariance stays small at a wrong optimum.
-    """
-    return refine_all(image, intrinsics, part, stable_pose, T_cam_table, x, y, yaw, config)[0]
-
-
 def refine_all(
     image: NDArray[np.uint8] | Image32 | EdgeImage,
     intrinsics: Intrinsics,
@@ -118,7 +98,12 @@ def refine_all(
     yaw: float,
     config: ContourConfig | None = None,
 ) -> list[Refinement]:
-    """Like ``refine``, but with every place that explains the image about as well, the best first.
+    """Lay the contour of a part resting on ``stable_pose`` on a gray crop (H, W), or its EdgeImage, near (x, y, yaw).
+
+    ``intrinsics`` are the crop's at its own resolution, ``T_cam_table`` (4, 4). Finds contours within the grid of the
+    config, at full resolution 8 pixels and 5 degrees, and returns every place that explains the image about as well as
+    the best, best first and at least one: the caller judges them by their scores, since a covariance stays small at a
+    wrong optimum.
 
     The outline of a shadow, or the inner edge of a rim, can look like the part's own outline; what lies inside of it
     tells them apart (see ``region``), which is for the caller to weigh.
