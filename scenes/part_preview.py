@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from cad.parts import Part, StablePose, load_part, part_names
 from cad.spatial import Array, Intrinsics, quat_wxyz_from_rotation, transform
 from scenes.camera import add_camera, set_camera_pose
+from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
 from scenes.look import add_material, add_mesh, add_part_material, add_visual
-from scenes.render import ClassicRenderer
 
 TILE_PX = 200
 _DISTANCE_M = 0.10

@@ -1,19 +1,21 @@
-"""Rendering behind one protocol: colour, part instances and depth of any camera window."""
+"""Rendering behind one protocol: colour, part instances and depth of any camera window.
+
+What is drawn depends on the compiled model and its data as they are when ``render`` is called: visible geoms,
+materials, lights, environment and camera. So one model serves every renderer, and changes at run time take effect.
+"""
 
 from __future__ import annotations
 
 import re
-import weakref
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Intrinsics
-from scenes.camera import CAMERA, set_intrinsics
-from scenes.errors import SceneError
-from scenes.gl import make_context, mujoco
+from scenes.camera import CAMERA
+from scenes.gl import mujoco
 
 What = Literal["rgb", "instances", "depth"]
 ALL: tuple[What, ...] = ("rgb", "instances", "depth")
@@ -26,13 +28,23 @@ COLLISION_GROUP, HIDDEN_GROUP = 3, 5
 class Rendering:
     """What was asked for of one window, (H, W) each; the rest is None.
 
-    ``rgb`` (H, W, 3) uint8; ``instances`` int16, the index of the part instance seen in a pixel or -1;
+    ``rgb`` (H, W, 3) grey levels of an ideal linear sensor that saturates at 255: uint8, or float32 that may exceed 255
+    where the renderer tells more. ``instances`` int16, the index of the part instance seen in a pixel or -1;
     ``depth_m`` float32, distance along the camera's z in metres.
     """
 
-    rgb: NDArray[np.uint8] | None = None
+    rgb: NDArray[np.uint8] | NDArray[np.float32] | None = None
     instances: NDArray[np.int16] | None = None
     depth_m: NDArray[np.float32] | None = None
+
+    @property
+    def picture(self) -> NDArray[np.uint8]:
+        """The colours (H, W, 3) as they are shown; raises ValueError when they were not asked for."""
+        if self.rgb is None:
+            raise ValueError("this rendering has no colours; ask for 'rgb'")
+        if self.rgb.dtype == np.uint8:
+            return self.rgb.view(np.uint8)
+        return np.rint(np.clip(self.rgb, 0, 255)).astype(np.uint8)
 
 
 class Renderer(Protocol):
@@ -51,109 +63,6 @@ class Renderer(Protocol):
     def close(self) -> None:
         """Free what the renderer holds; it cannot be used afterwards."""
         ...
-
-
-class ClassicRenderer:
-    """MuJoCo's rasteriser. One context is made for the largest window and reused for all smaller ones.
-
-    ``samples`` is the number of samples a pixel in colour frames; instances and depth are always of pixel centres.
-    """
-
-    def __init__(self, model: mujoco.MjModel, *, max_width: int, max_height: int, samples: int = 4) -> None:
-        self._model = model
-        self._size = (max_width, max_height)
-        model.vis.global_.offwidth, model.vis.global_.offheight = self._size
-        model.vis.quality.offsamples = samples
-        self._gl = make_context(max_width, max_height)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
-        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nsite + model.nlight + 64)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in VISUAL_GROUPS for group in range(6)]
-        self._option.sitegroup[:] = False
-        self._instance_of_geom = instance_of_geom(model)
-        self._free = weakref.finalize(self, _free, self._gl, self._context)
-
-    def render(
-        self,
-        data: mujoco.MjData,
-        intrinsics: Intrinsics,
-        what: tuple[What, ...] = ALL,
-        camera: str = CAMERA,
-    ) -> Rendering:
-        """See :class:`Renderer`. Raises SceneError for a window larger than the renderer was made for."""
-        if not self._free.alive:
-            raise SceneError("this renderer was closed; make a new ClassicRenderer")
-        width, height = intrinsics.width, intrinsics.height
-        if width > self._size[0] or height > self._size[1]:
-            raise SceneError(
-                f"a window of {width} x {height} does not fit into this renderer's {self._size[0]} x {self._size[1]}; "
-                "make the renderer with a larger max_width and max_height"
-            )
-        set_intrinsics(self._model, intrinsics, camera)
-        self._gl.make_current()
-        view = mujoco.MjvCamera()
-        view.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-        view.fixedcamid = self._model.camera(camera).id
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._option, None, view, everything, self._scene)
-        rect = mujoco.MjrRect(0, 0, width, height)
-        rgb = self._draw_rgb(rect) if "rgb" in what else None
-        instances = depth = None
-        if "instances" in what or "depth" in what:
-            colours, z = self._draw_ids(rect)
-            instances = self._instances(colours) if "instances" in what else None
-            depth = self._depth(z) if "depth" in what else None
-        return Rendering(rgb=rgb, instances=instances, depth_m=depth)
-
-    def close(self) -> None:
-        """Free the context, which otherwise happens when the renderer is collected; closing twice is harmless."""
-        self._free()
-
-    def __enter__(self) -> ClassicRenderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _draw_rgb(self, rect: mujoco.MjrRect) -> NDArray[np.uint8]:
-        rgb = np.empty((rect.height, rect.width, 3), np.uint8)
-        mujoco.mjr_render(rect, self._scene, self._context)
-        mujoco.mjr_readPixels(rgb, None, rect, self._context)
-        return np.ascontiguousarray(rgb[::-1])
-
-    def _draw_ids(self, rect: mujoco.MjrRect) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        colours = np.empty((rect.height, rect.width, 3), np.uint8)
-        z = np.empty((rect.height, rect.width), np.float32)
-        mujoco.mjr_render(rect, self._scene, self._context)
-        mujoco.mjr_readPixels(colours, z, rect, self._context)
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        return colours[::-1], z[::-1]
-
-    def _instances(self, colours: NDArray[np.uint8]) -> NDArray[np.int16]:
-        """Instance indices (H, W) from id colours (H, W, 3): red + 256 green + 65536 blue = scene geom + 1."""
-        ids = colours[..., 0].astype(np.int32) + (colours[..., 1].astype(np.int32) << 8)
-        table = np.full(self._scene.ngeom + 1, -1, np.int16)
-        for geom in self._scene.geoms[: self._scene.ngeom]:
-            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
-                table[geom.segid + 1] = self._instance_of_geom[geom.objid]
-        return table[ids]
-
-    def _depth(self, z: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Metres (H, W) from the reversed depth buffer (1 near, 0 far)."""
-        extent = self._model.stat.extent
-        near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
-        return (near * far / (near + z.astype(np.float64) * (far - near))).astype(np.float32)
-
-
-def _free(gl: Any, context: mujoco.MjrContext) -> None:
-    gl.make_current()
-    context.free()
-    gl.free()
 
 
 def instance_of_geom(model: mujoco.MjModel) -> NDArray[np.int16]:

@@ -33,9 +33,9 @@ class SensorConfig:
 
 
 def expose(
-    image: NDArray[np.uint8], sensor: SensorConfig, rng: np.random.Generator, downscale: int = 1
+    image: NDArray[np.uint8] | NDArray[np.float32], sensor: SensorConfig, rng: np.random.Generator, downscale: int = 1
 ) -> NDArray[np.uint8]:
-    """What the sensor reads of an ideal image (H, W, 3) uint8.
+    """What the sensor reads of an ideal image (H, W, 3), grey levels.
 
     ``downscale`` is the factor by which the image is smaller than the full-resolution frame: averaging over
     ``downscale`` x ``downscale`` pixels narrows blur and noise by that factor.

@@ -15,11 +15,12 @@ from cad.parts import Part
 from cad.spatial import BASLER, Array, Intrinsics, quat_wxyz_from_rotation
 from cad.tagboard import TagboardConfig
 from scenes.camera import add_camera, set_camera_pose
+from scenes.classic import ClassicRenderer
 from scenes.distractors import distractor_meshes
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_texture, add_visual, classic_finish
 from scenes.randomize import LIGHTS, Look, LookRanges, Surface, draw_distractor_surface, draw_part_surface
-from scenes.render import HIDDEN_GROUP, ClassicRenderer, Rendering, What
+from scenes.render import HIDDEN_GROUP, Rendering, What
 from scenes.shots import Placed, Shot
 
 LIGHT_DISTANCE_M = 0.5

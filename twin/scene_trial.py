@@ -14,9 +14,9 @@ from cad.robot import JOINT_NAMES
 from cad.spatial import Array, inverse, rotation_from_rotvec, transform
 from perception.estimates import Frame, FrameEstimate, PoseEstimator
 from scenes.camera import camera_pose, set_camera_pose
+from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
 from scenes.placement import settle_parts
-from scenes.render import ClassicRenderer
 from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.assessment import Beliefs, assess, centre, match, pose_error
 from twin.attempts import Attempt, AttemptFinished, AttemptStarted, Event, Looked

@@ -10,9 +10,9 @@ import numpy as np
 from cad.parts import BUILT_IN
 from cad.robot import JOINT_NAMES
 from cad.spatial import Array, rotation_x, transform
+from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
 from scenes.placement import settle_parts
-from scenes.render import ClassicRenderer
 from scenes.workcell import OVERVIEW, OVERVIEW_INTRINSICS, CellConfig, build_arm, build_workcell, set_parts
 from twin.ik import ArmIk
 from twin.pictures import save_picture
@@ -43,12 +43,12 @@ def save_views(out: Path, *, seed: int, parts_per_class: int = 2) -> list[Path]:
     room = [i for i in range(model.nlight) if model.light(i).name.startswith(ROOM)]
     with renderer:
         model.light_active[room] = False  # the camera's frame is lit by the cell's lamps alone
-        frame = renderer.render(data, cell.intrinsics, ("rgb",)).rgb
+        frame = renderer.render(data, cell.intrinsics, ("rgb",)).picture
         hover = transform(rotation_x(np.pi), [*T_world_part[0, :2, 3], cell.T_world_board[2, 3] + 0.06])
         _set_arm(data, ArmIk(build_arm(cell).compile(), np.array(cell.home_q)).solve(hover))
         mujoco.mj_forward(model, data)
         model.light_active[room] = True
-        side = renderer.render(data, OVERVIEW_INTRINSICS, ("rgb",), OVERVIEW).rgb
+        side = renderer.render(data, OVERVIEW_INTRINSICS, ("rgb",), OVERVIEW).picture
     assert frame is not None and side is not None
     height = FRAME_WIDTH * cell.intrinsics.height // cell.intrinsics.width
     small = np.asarray(cv2.resize(frame, (FRAME_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -9,9 +9,9 @@ from cad.spatial import BASLER, apply, inverse, rotation_z, transform
 from cad.tagboard import DICTIONARY
 from scenes.camera import add_camera, camera_pose, set_camera_pose
 from scenes.cell_config import CellConfig
+from scenes.classic import ClassicRenderer
 from scenes.errors import SceneError
 from scenes.gl import mujoco
-from scenes.render import ClassicRenderer
 from scenes.workcell import build_board_scene, set_parts
 
 CONFIG = CellConfig()
