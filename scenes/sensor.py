@@ -33,7 +33,10 @@ class SensorConfig:
 
 
 def expose(
-    image: NDArray[np.uint8] | NDArray[np.float32], sensor: SensorConfig, rng: np.random.Generator, downscale: int = 1
+    image: NDArray[np.uint8] | NDArray[np.float32],
+    sensor: SensorConfig,
+    rng: np.random.Generator,
+    downscale: float = 1.0,
 ) -> NDArray[np.uint8]:
     """What the sensor reads of an ideal image (H, W, 3), grey levels.
 

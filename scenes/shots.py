@@ -13,9 +13,6 @@ from cad.tagboard import TagboardConfig
 from scenes.errors import SceneError
 from scenes.randomize import ViewRanges, draw_camera
 
-CROP_SIZE, CROP_DOWNSCALE = 256, 2
-WINDOW_SIZE, WINDOW_DOWNSCALE = 320, 4
-
 
 @dataclass(frozen=True, kw_only=True)
 class Placed:
@@ -31,7 +28,7 @@ class Shot:
     """One image to render. ``downscale`` is how much smaller than the full-resolution frame its pixels are."""
 
     intrinsics: Intrinsics
-    downscale: int
+    downscale: float
     T_board_cam: Array
     focus_board: tuple[float, float]
     parts: tuple[Placed, ...]
@@ -81,8 +78,8 @@ class ShotSampler:
             (part.name, pose.index): footprint_radius(part, pose) for part in parts for pose in part.stable_poses
         }
 
-    def crop(self, rng: np.random.Generator, downscale: int = CROP_DOWNSCALE) -> Shot:
-        """A 256 x 256 window, ``downscale`` times smaller, round a part (entry 0 of ``parts``) or round none."""
+    def crop(self, rng: np.random.Generator, size: tuple[int, int] = (256, 256), downscale: int = 1) -> Shot:
+        """A window of ``size`` (w, h) pixels, ``downscale`` times the camera's, round a part (entry 0) or none."""
         ranges = self._ranges
         T_board_cam = draw_camera(ranges.view, rng)
         taken: list[tuple[float, float, float]] = []
@@ -101,8 +98,9 @@ class ShotSampler:
             self._add_near(x, y, distractors, taken, rng, part=False)
         u, v = BASLER.project(apply(inverse(T_board_cam), [x, y, 0.0]))
         jitter = rng.integers(-ranges.centre_jitter_px, ranges.centre_jitter_px + 1, 2)
-        corner = np.round([u, v]).astype(int) + jitter - CROP_SIZE // 2
-        window = BASLER.crop(int(corner[0]), int(corner[1]), CROP_SIZE, CROP_SIZE)
+        width, height = size[0] * downscale, size[1] * downscale
+        corner = np.round([u, v]).astype(int) + jitter - np.array([width, height]) // 2
+        window = BASLER.crop(int(corner[0]), int(corner[1]), width, height)
         return Shot(
             intrinsics=window.downscaled(downscale),
             downscale=downscale,
@@ -112,33 +110,42 @@ class ShotSampler:
             distractors=tuple(distractors),
         )
 
-    def window(self, rng: np.random.Generator) -> Shot:
-        """A 320 x 320 window of the quarter-resolution frame with some parts and distractors in it."""
+    def window(self, rng: np.random.Generator, size: tuple[int, int] = (320, 320), downscale: int = 4) -> Shot:
+        """A window of ``size`` (w, h) pixels of the reduced frame with some parts and distractors in it."""
         ranges = self._ranges
         T_board_cam = draw_camera(ranges.view, rng)
-        frame = BASLER.downscaled(WINDOW_DOWNSCALE)
-        limits = np.array([frame.width, frame.height]) - WINDOW_SIZE
+        frame = BASLER.downscaled(downscale)
+        limits = np.array([frame.width - size[0], frame.height - size[1]])
         corner = rng.integers(0, limits)
         if rng.random() < ranges.window_on_area:
             middle = rng.uniform(-1, 1, 2) * ranges.area_half_m
             pixel = frame.project(apply(inverse(T_board_cam), [*middle, 0.0]))
-            corner = np.clip(np.round(pixel - WINDOW_SIZE / 2).astype(int), 0, limits)
-        window = frame.crop(int(corner[0]), int(corner[1]), WINDOW_SIZE, WINDOW_SIZE)
-        focus = board_point(window, T_board_cam, (WINDOW_SIZE / 2, WINDOW_SIZE / 2))
+            corner = np.clip(np.round(pixel - np.array(size) / 2).astype(int), 0, limits)
+        window = frame.crop(int(corner[0]), int(corner[1]), *size)
+        return self._scatter(rng, window, T_board_cam, downscale)
+
+    def frame(self, rng: np.random.Generator, frame: Intrinsics, downscale: float) -> Shot:
+        """A whole frame, ``downscale`` times smaller than the camera's, with some parts and distractors in it."""
+        return self._scatter(rng, frame, draw_camera(self._ranges.view, rng), downscale)
+
+    def _scatter(self, rng: np.random.Generator, window: Intrinsics, T_board_cam: Array, downscale: float) -> Shot:
+        """Parts and distractors anywhere in a window."""
+        ranges, size = self._ranges, np.array([window.width, window.height])
+        focus = board_point(window, T_board_cam, (size[0] / 2, size[1] / 2))
         taken: list[tuple[float, float, float]] = []
         parts: list[Placed] = []
         distractors: list[Placed] = []
         wanted = ((parts, ranges.window_parts, True), (distractors, ranges.window_distractors, False))
         for objects, bounds, is_part in wanted:
             for _ in range(rng.integers(*bounds, endpoint=True)):
-                pixel = rng.uniform(0, WINDOW_SIZE, 2)
+                pixel = rng.uniform(0, size)
                 x, y = board_point(window, T_board_cam, (pixel[0], pixel[1]))
                 if is_part and not self._in_area(x, y):
                     continue
                 self._add_at(x, y, objects, taken, rng, part=is_part)
         return Shot(
             intrinsics=window,
-            downscale=WINDOW_DOWNSCALE,
+            downscale=downscale,
             T_board_cam=T_board_cam,
             focus_board=focus,
             parts=tuple(parts),

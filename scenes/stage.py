@@ -15,8 +15,8 @@ from cad.parts import Part
 from cad.spatial import BASLER, Array, Intrinsics, quat_wxyz_from_rotation
 from cad.tagboard import TagboardConfig
 from scenes.camera import add_camera, set_camera_pose
-from scenes.classic import ClassicRenderer
 from scenes.distractors import distractor_meshes
+from scenes.domains import Domain, make_renderer
 from scenes.gl import mujoco
 from scenes.look import add_board_visuals, add_material, add_mesh, add_texture, add_visual, classic_finish
 from scenes.randomize import LIGHTS, Look, LookRanges, Surface, draw_distractor_surface, draw_part_surface
@@ -28,14 +28,14 @@ LIGHT_DISTANCE_M = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfig:
-    """``slots`` instances of each part can be shown at once; windows are up to ``max_size`` pixels wide and high.
+    """``slots`` instances of each part can be shown at once; windows have up to ``max_size`` (width, height) pixels.
 
     ``shadow_half_m`` is half the side of the square round the shot's focus that shadows are computed for, on a map of
     ``shadow_size`` pixels.
     """
 
     slots: int
-    max_size: int
+    max_size: tuple[int, int]
     shadow_half_m: float
     shadow_size: int
 
@@ -48,18 +48,25 @@ class Stage:
         parts: Sequence[Part],
         textures: Sequence[NDArray[np.uint8]],
         config: StageConfig,
+        *,
+        domain: Domain = "classic",
+        environments: Sequence[NDArray[np.uint8]] = (),
         board: TagboardConfig | None = None,
     ) -> None:
         self._parts = {part.name: part for part in parts}
         self._textures = len(textures)
         self._slots = config.slots
         spec = _build(parts, textures, config, board or TagboardConfig())
+        _add_lamps(spec)
+        if domain != "classic":
+            _add_environments(spec, environments)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._first_slot = {part.name: k * config.slots for k, part in enumerate(parts)}
         self._distractors = distractor_meshes().keys()
         self._shown: list[int] = []
-        self._renderer = ClassicRenderer(self.model, max_width=config.max_size, max_height=config.max_size)
+        width, height = config.max_size
+        self._renderer = make_renderer(domain, self.model, max_width=width, max_height=height)
 
     def arrange(self, shot: Shot) -> NDArray[np.int16]:
         """Put camera, parts and distractors where the shot says; returns the instance index of each part (N,).
@@ -114,6 +121,10 @@ class Stage:
         """Draw what was arranged through a window."""
         return self._renderer.render(self.data, intrinsics, what)
 
+    def part(self, name: str) -> Part:
+        """One of the parts that the stage can show."""
+        return self._parts[name]
+
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
@@ -155,9 +166,6 @@ def _build(
     spec.visual.map.znear, spec.visual.map.zfar = 0.02, 10.0
     spec.visual.map.shadowclip, spec.visual.quality.shadowsize = config.shadow_half_m, config.shadow_size
     spec.visual.headlight.diffuse = spec.visual.headlight.specular = [0.0] * 3
-    for i in range(LIGHTS):
-        light = spec.worldbody.add_light(name=f"lamp_{i}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-        light.ambient, light.dir = [0.0] * 3, [0.0, 0.0, -1.0]
     body = spec.worldbody.add_body(name="board")
     add_board_visuals(spec, body, board)
     add_camera(body, BASLER, _above())
@@ -176,6 +184,23 @@ def _build(
         add_mesh(spec, name, mesh)
         _add_slot(spec, name, name)
     return spec
+
+
+def _add_lamps(spec: mujoco.MjSpec) -> None:
+    for i in range(LIGHTS):
+        light = spec.worldbody.add_light(name=f"lamp_{i}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        light.ambient, light.dir = [0.0] * 3, [0.0, 0.0, -1.0]
+
+
+def _add_environments(spec: mujoco.MjSpec, environments: Sequence[NDArray[np.uint8]]) -> None:
+    """An image light for each cube map (6, N, N, 3): what metal reflects; one of them is on at a time."""
+    for k, faces in enumerate(environments):
+        name = f"environment_{k:02d}"
+        texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_CUBE)
+        texture.height, texture.width, texture.nchannel = 6 * faces.shape[1], faces.shape[2], 3
+        texture.data = np.ascontiguousarray(faces).tobytes()
+        light = spec.worldbody.add_light(name=name, type=mujoco.mjtLightType.mjLIGHT_IMAGE, texture=name)
+        light.intensity, light.active = 8000.0, k == 0
 
 
 def _add_slot(spec: mujoco.MjSpec, name: str, mesh: str) -> None:

@@ -50,8 +50,8 @@ class Pick(PickConfig):
 class Render:
     """Render a labelled data set in BOP layout: crops of single parts, or windows of whole scenes."""
 
-    kind: Literal["crop", "fine", "scene"] = "crop"
-    """Crops of one part each at half resolution or (fine) at full resolution, or windows of scenes with many parts."""
+    kind: Literal["crop", "window", "scene"] = "crop"
+    """Crops round one part each, windows with any number of parts, or whole frames."""
     split: Literal["train", "val"] = "train"
     """Which board textures, lights and camera heights to draw from."""
     count: int = 1000
@@ -67,10 +67,11 @@ class Render:
 
     def run(self) -> None:
         """Generate what is missing of the data set."""
-        from scenes.generate import DatasetConfig, generate
+        from scenes.dataset_config import DatasetConfig
+        from scenes.generate import generate
 
-        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed, jobs=self.jobs)
-        generate(config, self.out, report=lambda line: print(line, file=sys.stderr, flush=True))
+        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed)
+        generate(config, self.out, jobs=self.jobs, report=lambda line: print(line, file=sys.stderr, flush=True))
         if self.json:
             print(json.dumps({"out": str(self.out)} | dataclasses.asdict(config), default=str, indent=1))
 

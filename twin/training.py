@@ -5,19 +5,23 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from perception.fit_choice import ChoiceFitConfig, fit_choice
 from perception.train import trainer
-from scenes.generate import DatasetConfig, generate
+from scenes.dataset_config import DatasetConfig
+from scenes.generate import generate
 from twin.robot import TwinError
 
+HALF_CROPS: dict[str, Any] = {"kind": "crop", "size": (128, 128), "downscale": 2, "faces": "uniform"}
+"""What the crop networks see: 128 x 128 pixels at half the camera's resolution, every face as often."""
+
 DATASETS: dict[str, DatasetConfig] = {
-    "crops_train": DatasetConfig(kind="crop", split="train", count=20_000, seed=1),
-    "crops_val": DatasetConfig(kind="crop", split="val", count=1_500, seed=2),
-    "windows_train": DatasetConfig(kind="scene", split="train", count=4_000, seed=3, chunk=250),
-    "windows_val": DatasetConfig(kind="scene", split="val", count=200, seed=4, chunk=250),
-    "fine_val": DatasetConfig(kind="fine", split="val", count=1_200, seed=5, chunk=300),
+    "crops_train": DatasetConfig(**HALF_CROPS, split="train", count=20_000, seed=1),
+    "crops_val": DatasetConfig(**HALF_CROPS, split="val", count=1_500, seed=2),
+    "windows_train": DatasetConfig(kind="window", faces="uniform", split="train", count=4_000, seed=3),
+    "windows_val": DatasetConfig(kind="window", faces="uniform", split="val", count=200, seed=4),
+    "fine_val": DatasetConfig(kind="crop", faces="uniform", split="val", count=1_200, seed=5),
 }
 """What the committed weights were trained on; ``tagcell train --seed`` shifts the seeds."""
 
@@ -41,7 +45,7 @@ def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int,
     if seed < 0:
         raise TwinError(f"seed is {seed}; it must not be negative")
     for name, config in DATASETS.items():
-        generate(_for_run(config, seed, jobs or os.cpu_count() or 1), data / name)
+        generate(replace(config, seed=config.seed + 1000 * seed), data / name, jobs=jobs or os.cpu_count() or 1)
     written = []
     for name, (kind, share) in SHARES.items():
         train = trainer(name)
@@ -58,7 +62,3 @@ def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int,
         written.append(out / "weights" / f"{name}.safetensors")
     fit_choice(ChoiceFitConfig(data=data / "fine_val", out=out / "weights"))
     return [*written, out / "weights" / "choice.json"]
-
-
-def _for_run(config: DatasetConfig, seed: int, jobs: int) -> DatasetConfig:
-    return replace(config, seed=config.seed + 1000 * seed, jobs=jobs)
