@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,10 +20,10 @@ from cad.equivalence import symmetries_to_json
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics
 from scenes.errors import SceneError
+from scenes.png import encode_png
 
 DEPTH_SCALE = 0.02
 """Millimetres a unit of the 16-bit depth images: steps of 20 um up to 1.3 m."""
-PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 MASKS = ("mask", "mask_visib")
 
 
@@ -67,12 +66,12 @@ class ChunkWriter:
     ) -> None:
         """Append an image (H, W, 3) with its camera and its parts in order."""
         image = len(self._cameras)
-        _write(self._aside / "rgb" / f"{image:06d}.png", rgb[..., ::-1])
+        _write(self._aside / "rgb" / f"{image:06d}.png", rgb)
         if depth_m is not None:
             units = np.rint(depth_m * (1e3 / DEPTH_SCALE))
             _write(self._aside / "depth" / f"{image:06d}.png", np.where(units < 65536, units, 0).astype(np.uint16))
         for k, annotation in enumerate(annotations):
-            encoded = _encode(annotation.mask.astype(np.uint8) * 255)
+            encoded = encode_png(annotation.mask)
             for name in MASKS:
                 (self._aside / name / f"{image:06d}_{k:06d}.png").write_bytes(encoded)
         self._cameras[str(image)] = {
@@ -149,14 +148,8 @@ def _info(annotation: Annotation) -> dict[str, Any]:
     }
 
 
-def _encode(image: NDArray[Any]) -> bytes:
-    ok, data = cv2.imencode(".png", image, PNG)
-    assert ok
-    return data.tobytes()
-
-
 def _write(path: Path, image: NDArray[Any]) -> None:
     try:
-        path.write_bytes(_encode(np.ascontiguousarray(image)))
+        path.write_bytes(encode_png(image))
     except OSError as error:
         raise SceneError(f"cannot write {path}: {error}") from error
