@@ -12,28 +12,34 @@ from importlib import metadata
 from twin.robot import TwinError
 
 GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
-GL_COMMAND = f"apt-get update && apt-get install -y {' '.join(GL_PACKAGES)}"
-_PROBE = "from scenes.gl import make_context; make_context(8, 8)"
+VULKAN_PACKAGES = ("libvulkan1", "mesa-vulkan-drivers")
+_DOMAINS = ("classic", "filament", "mitsuba")
+_PROBES = {
+    domain: f"from scenes.domains import domain_problem; print(domain_problem({domain!r}), end='')"
+    for domain in _DOMAINS
+} | {"classic": "from scenes.gl import make_context; make_context(8, 8)"}
 
 
-def gl_works() -> bool:
-    """Whether a frame can be rendered without a screen, tried in a process of its own."""
-    return subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, check=False).returncode == 0
+def domain_state(domain: str) -> str:
+    """What keeps a domain from being rendered, empty when nothing does; tried in a process of its own."""
+    done = subprocess.run([sys.executable, "-c", _PROBES[domain]], capture_output=True, text=True, check=False)
+    if done.returncode:
+        return (done.stderr.strip().splitlines() or [f"the renderer ended with code {done.returncode}"])[-1]
+    return done.stdout.strip()
 
 
-def install_gl() -> None:
-    """Install the Debian packages for rendering without a screen.
+def install(packages: tuple[str, ...], purpose: str) -> None:
+    """Install Debian packages.
 
     Raises TwinError with the one command to run where this process may not install packages or that failed.
     """
     may = hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("apt-get")
-    prefix = "" if may else "sudo "
-    advice = f"no OpenGL route for rendering without a screen; run: {prefix}sh -c '{GL_COMMAND}'"
+    advice = f"{purpose} needs {' '.join(packages)}; run: {'' if may else 'sudo '}sh -c '{_command(packages)}'"
     if not may:
         raise TwinError(advice)
-    print(f"installing {' '.join(GL_PACKAGES)} for rendering without a screen", flush=True)
+    print(f"installing {' '.join(packages)} for {purpose}", flush=True)
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
-    for command in (["apt-get", "update", "-qq"], ["apt-get", "install", "-y", "-qq", *GL_PACKAGES]):
+    for command in (["apt-get", "update", "-qq"], ["apt-get", "install", "-y", "-qq", *packages]):
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
             raise TwinError(f"{advice}\n(`{' '.join(command)}` failed: {done.stderr.strip()[-300:]})")
@@ -48,19 +54,30 @@ def versions() -> dict[str, str]:
 def doctor(fix: bool = False) -> dict[str, str]:
     """Check the machine; with ``fix`` install what is missing and may be installed.
 
-    Raises TwinError on what is left, with the command that mends it.
+    Raises TwinError when nothing can be rendered, with the command that mends it. The other domains are optional:
+    their lines in the report say what they need.
     """
-    report = versions()
-    if not gl_works():
-        if not fix:
-            raise TwinError(
-                f"no OpenGL route for rendering without a screen; run: tagcell doctor --fix, or: {GL_COMMAND}"
-            )
-        install_gl()
-        if not gl_works():
-            raise TwinError(
-                f"rendering still fails after installing {' '.join(GL_PACKAGES)}; try MUJOCO_GL=osmesa with libosmesa6"
-            )
-    report["rendering"] = "works"
-    report["cores"] = str(os.cpu_count())
-    return report
+    problems = {domain: domain_state(domain) for domain in _DOMAINS}
+    if problems["classic"] and fix:
+        install(GL_PACKAGES, "rendering without a screen")
+        problems["classic"] = domain_state("classic")
+    if problems["classic"]:
+        raise TwinError(
+            f"nothing can be rendered without a screen: {problems['classic']}\n"
+            f"run: tagcell doctor --fix, or: {_command(GL_PACKAGES)}; else try MUJOCO_GL=osmesa with libosmesa6"
+        )
+    if problems["filament"] and fix:
+        try:
+            install(VULKAN_PACKAGES, "the filament domain")
+            problems["filament"] = domain_state("filament")
+        except TwinError as error:
+            print(f"left out: {error}", file=sys.stderr)
+    return (
+        versions()
+        | {f"{domain} rendering": " ".join(problem.split()) or "works" for domain, problem in problems.items()}
+        | {"cores": str(os.cpu_count())}
+    )
+
+
+def _command(packages: tuple[str, ...]) -> str:
+    return f"apt-get update && apt-get install -y {' '.join(packages)}"
