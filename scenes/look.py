@@ -158,3 +158,8 @@ def _add_labels(spec: mujoco.MjSpec, body: mujoco.MjsBody, config: TagboardConfi
 def classic_finish(metallic: float, roughness: float) -> tuple[float, float]:
     """Specular and shininess that stand for a physically based finish in the classic renderer."""
     return 0.15 + 0.45 * metallic, max(0.05, 0.9 - roughness)
+
+
+def pbr_finish(specular: float, shininess: float) -> tuple[float, float]:
+    """Metallic and roughness, 0..1, of a finish that only says how the classic renderer draws it."""
+    return min(max((specular - 0.15) / 0.45, 0.0), 1.0), min(max(0.9 - shininess, 0.05), 1.0)
