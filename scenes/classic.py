@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -87,29 +89,50 @@ class ClassicRenderer:
         return np.ascontiguousarray(rgb[::-1])
 
     def _draw_ids(self, rect: mujoco.MjrRect) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Id colours (H, W, 3) and the depth buffer (H, W), bottom row first."""
         flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         colours = np.empty((rect.height, rect.width, 3), np.uint8)
         z = np.empty((rect.height, rect.width), np.float32)
-        mujoco.mjr_render(rect, self._scene, self._context)
-        mujoco.mjr_readPixels(colours, z, rect, self._context)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        with self._one_sample():
+            mujoco.mjr_render(rect, self._scene, self._context)
+            mujoco.mjr_readPixels(colours, z, rect, self._context)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        return colours[::-1], z[::-1]
+        return colours, z
+
+    @contextmanager
+    def _one_sample(self) -> Iterator[None]:
+        """Draw straight into the buffer that colour frames are averaged into, of one sample a pixel.
+
+        Ids and depth are of pixel centres, the same from either buffer; this one takes less than half the time.
+        """
+        context = self._context
+        before = context.offFBO, context.offSamples
+        if context.offSamples:
+            context.offFBO, context.offSamples = context.offFBO_r, 0
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        try:
+            yield
+        finally:
+            context.offFBO, context.offSamples = before
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
 
     def _instances(self, colours: NDArray[np.uint8]) -> NDArray[np.int16]:
         """Instance indices (H, W) from id colours (H, W, 3): red + 256 green + 65536 blue = scene geom + 1."""
-        ids = colours[..., 0].astype(np.int32) + (colours[..., 1].astype(np.int32) << 8)
+        ids: NDArray[Any] = colours[::-1, :, 0]
+        if self._scene.ngeom > 254:
+            ids = ids + (colours[::-1, :, 1].astype(np.uint16) << 8)
         table = np.full(self._scene.ngeom + 1, -1, np.int16)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 table[geom.segid + 1] = self._instance_of_geom[geom.objid]
-        return table[ids]
+        return np.take(table, ids)
 
     def _depth(self, z: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Metres (H, W) from the reversed depth buffer (1 near, 0 far)."""
+        """Metres (H, W) from the reversed depth buffer (1 near, 0 far), bottom row first."""
         extent = self._model.stat.extent
         near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
-        return (near * far / (near + z.astype(np.float64) * (far - near))).astype(np.float32)
+        return (near * far / (near + z[::-1].astype(np.float64) * (far - near))).astype(np.float32)
 
 
 def _free(gl: Any, context: mujoco.MjrContext) -> None:

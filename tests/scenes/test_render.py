@@ -110,6 +110,19 @@ def test_window_equals_the_same_part_of_a_larger_one(renderer, scene):
     assert np.abs(piece.rgb.astype(int) - whole.rgb[there]).mean() < 0.1
 
 
+def test_labels_do_not_depend_on_the_samples_of_colour_frames(renderer, scene):
+    model, data, T_cam_part = scene
+    window = window_round(BASLER.project(T_cam_part[0, :3, 3]))
+    before = renderer.render(data, window)
+    with ClassicRenderer(model, max_width=256, max_height=256, samples=0) as plain:
+        once = plain.render(data, window)
+    again = renderer.render(data, window)
+    np.testing.assert_array_equal(before.instances, once.instances)
+    np.testing.assert_array_equal(before.depth_m, once.depth_m)
+    np.testing.assert_array_equal(before.rgb, again.rgb)
+    assert (before.rgb != once.rgb).any(), "colours are averaged over samples"
+
+
 def test_depth_is_the_height_of_the_board_in_metres(renderer, scene):
     _, data, _ = scene
     drawn = renderer.render(data, BASLER.crop(2000, 3000, 64, 64), ("depth", "instances"))
