@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from scenes.bop import ChunkWriter, write_models
+from scenes.bop import ChunkWriter, write_camera, write_models
 from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
 from scenes.image_maker import ImageMaker
@@ -52,6 +52,7 @@ def _open_folder(config: DatasetConfig, out: Path) -> Path:
         split = out / config.split
         split.mkdir(parents=True, exist_ok=True)
         write_models(out, parts)
+        write_camera(out, config.frame)
         path.write_text(manifest)
     except OSError as error:
         raise SceneError(f"cannot write into {out}: {error}") from error
@@ -96,15 +97,20 @@ class ChunkMaker:
 
     def __init__(self, config: DatasetConfig) -> None:
         self._config = config
+        self._parts = config.load_parts()
         self._maker = ImageMaker(config)
 
     def make(self, index: int, folder: Path, count: int) -> int:
         """Make shard ``index`` of ``count`` images in ``folder``; returns the index."""
-        writer = ChunkWriter(folder, with_depth=self._config.depth)
+        aside = folder.with_name(f".{folder.name}.partial")
+        shutil.rmtree(aside, ignore_errors=True)
+        config = self._config
+        writer = ChunkWriter(aside, index, self._parts, with_depth=config.depth, jpeg=config.jpeg)
         for k in range(count):
             made = self._maker.make(index * self._config.shard_size + k)
             writer.add(made.image, made.intrinsics, made.T_cam_board, made.annotations, made.depth_m)
         writer.finish()
+        aside.rename(folder)
         return index
 
     def close(self) -> None:

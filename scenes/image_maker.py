@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Array, Intrinsics, inverse
-from scenes.annotations import annotate
+from scenes.annotations import Labeller
 from scenes.bop import Annotation
 from scenes.dataset_config import DatasetConfig, Split
 from scenes.distractors import distractor_meshes
@@ -48,6 +48,7 @@ class ImageMaker:
         parts = config.load_parts()
         textures = make_textures(np.random.default_rng(STREAMS[config.split]), TEXTURES)
         self._stage = Stage(parts, textures, stage_config(config), domain=config.domain)
+        self._labeller = Labeller(self._stage)
         radii = {n: float(np.linalg.norm(m.vertices[:, :2], axis=1).max()) for n, m in distractor_meshes().items()}
         self._sampler = ShotSampler(parts, radii, config.shots)
 
@@ -68,7 +69,7 @@ class ImageMaker:
             image=expose(drawn.rgb, sensor, sensor_rng, shot.downscale),
             intrinsics=shot.intrinsics,
             T_cam_board=inverse(shot.T_board_cam),
-            annotations=annotate(stage, shot, instances, drawn),
+            annotations=self._labeller.label(shot, instances, drawn),
             depth_m=drawn.depth_m if config.depth else None,
         )
 

@@ -125,6 +125,11 @@ class Stage:
         """One of the parts that the stage can show."""
         return self._parts[name]
 
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """The geoms of the parts and distractors arranged last."""
+        return tuple(self._shown)
+
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
