@@ -91,7 +91,7 @@ class CocoScene:
 def encode_runs(window: NDArray[np.bool_], corner: tuple[int, int], shape: tuple[int, int]) -> dict[str, Any]:
     """COCO's compressed run lengths of an image of ``shape`` (H, W) that is false but for a ``window`` at ``corner``.
 
-    Runs go down the columns. Only the window is looked at: coding the whole of a large frame takes a hundred times longer.
+    Runs go down the columns. Only the window is looked at: a whole frame would take a hundred times longer.
     """
     (height, width), (x, y) = shape, corner
     inside = window[max(0, -y) : max(0, height - y), max(0, -x) : max(0, width - x)]
