@@ -29,14 +29,13 @@ _UNSET_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 @dataclass(frozen=True, kw_only=True)
 class Finish:
     """A physically based surface. ``rgb`` (3,) base colour, linear; ``metallic`` and ``roughness`` 0..1 (perceptual);
-    ``emission`` its own radiance in multiples of ``rgb``. ``texture`` indexes the model's textures (-1: none), is
-    multiplied with ``rgb`` and repeated ``repeat`` (2,) times over the unit square.
+    ``texture`` indexes the model's textures (-1: none), is multiplied with ``rgb`` and repeated ``repeat`` (2,) times
+    over the unit square.
     """
 
     rgb: tuple[float, float, float]
     metallic: float
     roughness: float
-    emission: float = 0.0
     texture: int = -1
     repeat: tuple[float, float] = (1.0, 1.0)
 
@@ -216,7 +215,6 @@ def _finish(model: mujoco.MjModel, i: int) -> tuple[NDArray[np.float32], Finish]
         rgb=_triple(rgba),
         metallic=metallic,
         roughness=roughness,
-        emission=float(model.mat_emission[k]),
         texture=int(model.mat_texid[k, mujoco.mjtTextureRole.mjTEXROLE_RGB]),
         repeat=(float(repeat[0]), float(repeat[1])),
     )
