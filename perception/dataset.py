@@ -1,15 +1,8 @@
-"""Reads the rendered training data: BOP layout on disk, arrays in memory, one cache file beside the data.
-
-A data set is a folder with a manifest ``dataset.json``, which says how it was made and how many images it has, and one
-split: chunks of images ``SPLIT/NNNNNN/`` in BOP layout (millimetres, world = board frame) with our key ``stable_pose``
-in ``scene_gt.json``. In memory everything is in metres.
-"""
+"""Rendered data sets as arrays in memory, with one cache file beside the data. Metres; world = board frame."""
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -17,17 +10,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.parts import Part, hash_file
+from cad.parts import Part
 from cad.resting import as_rest
-from cad.spatial import Array, apply, inverse, transform, yaw_of
+from cad.spatial import Array, apply, inverse, yaw_of
+from perception.bop_files import Entry, manifest_hash, read_entries
 from perception.calibration import table_from_board
 from perception.estimates import PerceptionError
 
-MANIFEST = "dataset.json"
 CACHE = "cache.npz"
 MAX_INSTANCES = 255
 
@@ -156,14 +148,6 @@ def resting_poses(
     )
 
 
-def manifest_hash(data_dir: Path) -> str:
-    """Hash of a data set's manifest, which names the data in caches and weight files."""
-    path = data_dir / MANIFEST
-    if not path.exists():
-        raise PerceptionError(f"no {MANIFEST} in {data_dir}: it is no rendered data set; render one there first")
-    return hash_file(path)
-
-
 def load_crops(data_dir: Path) -> CropSet:
     """All crops of a data set, from the cache beside it when that is of the same manifest."""
     return _cached(data_dir, CropSet, _read_crops)
@@ -190,64 +174,9 @@ def _cached(data_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> K
     return loaded
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """One image of a chunk and what its JSON files say about it."""
-
-    chunk: Path
-    image_id: int
-    camera: dict[str, Any]
-    instances: list[dict[str, Any]]
-
-    def image(self) -> NDArray[np.uint8]:
-        for suffix in (".png", ".jpg"):
-            path = self.chunk / "rgb" / f"{self.image_id:06d}{suffix}"
-            if path.exists():
-                return _read_image(path, cv2.IMREAD_COLOR)[..., ::-1]
-        raise PerceptionError(f"no image {self.image_id:06d}.png or .jpg in {self.chunk / 'rgb'}")
-
-    def mask(self, instance: int) -> NDArray[np.bool_]:
-        name = f"{self.image_id:06d}_{instance:06d}.png"
-        return _read_image(self.chunk / "mask_visib" / name, cv2.IMREAD_GRAYSCALE) > 0
-
-
-def _entries(data_dir: Path) -> list[_Entry]:
-    manifest = _read_json(data_dir / MANIFEST)
-    chunks = sorted(p for p in (data_dir / manifest["split"]).glob("*") if re.fullmatch(r"\d{6}", p.name))
-    out = []
-    for chunk in chunks:
-        cameras, truth = (_read_json(chunk / name) for name in ("scene_camera.json", "scene_gt.json"))
-        if set(cameras) != set(truth):
-            raise PerceptionError(f"{chunk}: scene_camera.json has {len(cameras)} images, scene_gt.json {len(truth)}")
-        out += [_Entry(chunk, i, cameras[str(i)], truth[str(i)]) for i in sorted(map(int, cameras))]
-    if len(out) != manifest["count"]:
-        raise PerceptionError(
-            f"{data_dir} holds {len(out)} of its {manifest['count']} images: its rendering did not finish; run it again"
-        )
-    return out
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise PerceptionError(f"{path} cannot be read: {error}") from error
-
-
-def _read_image(path: Path, flags: int) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), flags)
-    if image is None:
-        raise PerceptionError(f"{path} is missing or is no image")
-    return np.asarray(image, np.uint8)
-
-
-def _pose_m(entry: dict[str, Any], rotation: str, translation: str) -> Array:
-    return transform(np.reshape(entry[rotation], (3, 3)), np.asarray(entry[translation], np.float64) / 1e3)
-
-
-def _read_images(entries: Sequence[_Entry]) -> NDArray[np.uint8]:
+def _read_images(entries: Sequence[Entry]) -> NDArray[np.uint8]:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        images = pool.map(_Entry.image, entries)
+        images = pool.map(Entry.image, entries)
         first = next(images)
         out = np.empty((len(entries), *first.shape), np.uint8)
         out[0] = first
@@ -261,15 +190,9 @@ def _read_images(entries: Sequence[_Entry]) -> NDArray[np.uint8]:
     return out
 
 
-def _cameras(entries: Sequence[_Entry]) -> tuple[Array, Array]:
-    K = np.stack([np.reshape(e.camera["cam_K"], (3, 3)).astype(np.float64) for e in entries])
-    return np.stack([_pose_m(e.camera, "cam_R_w2c", "cam_t_w2c") for e in entries]), K
-
-
 def _read_crops(data_dir: Path) -> CropSet:
-    entries = _entries(data_dir)
+    entries = read_entries(data_dir)
     images = _read_images(entries)
-    T_cam_board, K = _cameras(entries)
     targets = [e.instances[0] if e.instances else None for e in entries]
     empty = np.zeros(images.shape[1:3], bool)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -279,14 +202,14 @@ def _read_crops(data_dir: Path) -> CropSet:
         images=images,
         obj_id=np.array([t["obj_id"] if t else 0 for t in targets], np.int64),
         stable_pose=np.array([t["stable_pose"] if t else -1 for t in targets], np.int64),
-        T_cam_part=np.stack([_pose_m(t, "cam_R_m2c", "cam_t_m2c") if t else np.eye(4) for t in targets]),
-        T_cam_board=T_cam_board,
-        K=K,
+        T_cam_part=np.stack([e.T_cam_part(0) if e.instances else np.eye(4) for e in entries]),
+        T_cam_board=np.stack([e.T_cam_board for e in entries]),
+        K=np.stack([e.K for e in entries]),
         packed_masks=packed,
     )
 
 
-def _instance_map(entry: _Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
+def _instance_map(entry: Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
     if len(entry.instances) > MAX_INSTANCES:
         raise PerceptionError(f"image {entry.image_id} of {entry.chunk} has more than {MAX_INSTANCES} instances")
     out = np.zeros(shape, np.uint8)
@@ -296,20 +219,19 @@ def _instance_map(entry: _Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _read_windows(data_dir: Path) -> WindowSet:
-    entries = _entries(data_dir)
+    entries = read_entries(data_dir)
     images = _read_images(entries)
-    T_cam_board, K = _cameras(entries)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         maps = np.stack(list(pool.map(lambda e: _instance_map(e, images.shape[1:3]), entries)))
     flat = [(i, k, instance) for i, e in enumerate(entries) for k, instance in enumerate(e.instances)]
     return WindowSet(
         images=images,
         instance_map=maps,
-        T_cam_board=T_cam_board,
-        K=K,
+        T_cam_board=np.stack([e.T_cam_board for e in entries]),
+        K=np.stack([e.K for e in entries]),
         image_index=np.array([i for i, _, _ in flat], np.int64),
         instance=np.array([k for _, k, _ in flat], np.int64),
         obj_id=np.array([g["obj_id"] for _, _, g in flat], np.int64),
         stable_pose=np.array([g["stable_pose"] for _, _, g in flat], np.int64),
-        T_cam_part=np.array([_pose_m(g, "cam_R_m2c", "cam_t_m2c") for _, _, g in flat]).reshape(-1, 4, 4),
+        T_cam_part=np.array([entries[i].T_cam_part(k) for i, k, _ in flat]).reshape(-1, 4, 4),
     )

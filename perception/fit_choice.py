@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Array, Intrinsics
+from perception.bop_files import manifest_hash
 from perception.choice import (
     FEATURES,
     GATE_FEATURES,
@@ -24,7 +25,7 @@ from perception.choice import (
     threshold_for,
 )
 from perception.crop_poses import CROP_PX, Candidate, CropPoseConfig, CropSolver
-from perception.dataset import CropSet, Labels, load_crops, manifest_hash
+from perception.dataset import CropSet, Labels, load_crops
 from perception.estimates import PerceptionError
 from perception.posenets import PoseNets
 

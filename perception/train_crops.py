@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from perception.augment import CROP, Photometric, crop_warp, warp_image
+from perception.bop_files import manifest_hash
 from perception.classifier import JointClassifier, SoftLabels, classifier_loss
-from perception.dataset import CropSet, load_crops, manifest_hash
+from perception.dataset import CropSet, load_crops
 from perception.faces import FaceTable
 from perception.labels import CropLabels, label_crops, take_crops
 from perception.pvnet import GRID, PVNet, pvnet_loss, sample_cells

@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from cad.parts import BUILT_IN, load_part
 from cad.spatial import Array
-from perception.dataset import load_windows, manifest_hash
+from perception.bop_files import manifest_hash
+from perception.dataset import load_windows
 from perception.metrics import DetectionScores, mask_iou, summary
 from perception.segmentation import (
     HEAT_STRIDE,

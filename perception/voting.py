@@ -23,6 +23,21 @@ class VotingError(PerceptionError):
     """Too few pixels, or shapes that do not fit each other."""
 
 
+def vector_field(mask: ArrayLike, keypoints: ArrayLike) -> NDArray[np.float32]:
+    """PVNet's training target (H, W, K, 2): at each pixel of ``mask`` (H, W) the unit vectors towards the ``keypoints``
+    (K, 2), pixels u, v; zero beside the mask and where a keypoint is at the pixel itself.
+    """
+    inside, points = np.asarray(mask, dtype=bool), np.asarray(keypoints, dtype=np.float64)
+    if inside.ndim != 2 or points.ndim != 2 or points.shape[1] != 2:
+        raise VotingError(f"mask {inside.shape} and keypoints {points.shape}: expected (H, W) and (K, 2)")
+    v, u = np.nonzero(inside)
+    towards = points - np.stack([u, v], axis=-1)[:, None]
+    distance = np.linalg.norm(towards, axis=-1, keepdims=True)
+    field = np.zeros((*inside.shape, len(points), 2), np.float32)
+    field[v, u] = np.divide(towards, distance, out=np.zeros_like(towards), where=distance > 0)
+    return field
+
+
 def ransac_vote(
     pixels: ArrayLike, directions: ArrayLike, rng: np.random.Generator, hypotheses: int = HYPOTHESES
 ) -> tuple[Array, Array]:

@@ -1,10 +1,14 @@
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from data_sets import Picture, patch, write_data_set
 
 from cad.equivalence import Symmetries
 from cad.parts import Part, StablePose, planar
@@ -40,7 +44,7 @@ def part(obj_id: int) -> Part:
             StablePose(index=i, R_table_part=R, t_table_part=np.array([0.0, 0.0, h]), probability=0.5, view_class=i)
             for i, (R, h) in enumerate(zip(rotations, heights, strict=True))
         ),
-        keypoints=np.zeros((8, 3)),
+        keypoints=np.eye(8, 3) * 1e-3,
         mesh_hash="0" * 16,
     )
 
@@ -52,40 +56,16 @@ def pose_of(k: int) -> Array:
     return table_from_board(T_CAM_BOARD) @ planar(X, Y, YAW) @ PARTS[0].stable_poses[k].T_table_part
 
 
-def write_split(folder: Path, instances: list[list[tuple[int, int]]], size: int = SIZE) -> Path:
-    """A data set with one image per list of (obj_id, stable_pose); instance k is a 5-pixel square at (10 k, 8)."""
-    chunk = folder / "val" / "000000"
-    for name in ("rgb", "mask_visib"):
-        (chunk / name).mkdir(parents=True)
-    camera, truth = {}, {}
-    mm = T_CAM_BOARD[:3, 3] * 1e3
-    for i, parts in enumerate(instances):
-        image = np.full((size, size, 3), (10 + i, 20, 30), np.uint8)
-        cv2.imwrite(str(chunk / "rgb" / f"{i:06d}.png"), image[..., ::-1])
-        camera[str(i)] = {
-            "cam_K": WINDOW.matrix.ravel().tolist(),
-            "depth_scale": 0.1,
-            "cam_R_w2c": T_CAM_BOARD[:3, :3].ravel().tolist(),
-            "cam_t_w2c": mm.tolist(),
-        }
-        truth[str(i)] = []
-        for k, (obj_id, stable_pose) in enumerate(parts):
-            mask = np.zeros((size, size), np.uint8)
-            mask[8:13, 10 * k : 10 * k + 5] = 255
-            cv2.imwrite(str(chunk / "mask_visib" / f"{i:06d}_{k:06d}.png"), mask)
-            T = pose_of(stable_pose)
-            truth[str(i)].append(
-                {
-                    "obj_id": obj_id,
-                    "cam_R_m2c": T[:3, :3].ravel().tolist(),
-                    "cam_t_m2c": (T[:3, 3] * 1e3).tolist(),
-                    "stable_pose": stable_pose,
-                }
-            )
-    (chunk / "scene_camera.json").write_text(json.dumps(camera))
-    (chunk / "scene_gt.json").write_text(json.dumps(truth))
-    (folder / "dataset.json").write_text(json.dumps({"split": "val", "count": len(instances)}))
-    return folder
+def picture(i: int, parts: list[tuple[int, int]], size: int = SIZE) -> Picture:
+    """An image with parts of these (obj_id, stable_pose); part k is a 5-pixel square at (10 k, 8)."""
+    rgb = np.full((size, size, 3), (10 + i, 20, 30), np.uint8)
+    annotations = [patch(obj_id, face, pose_of(face), 10 * k, 8) for k, (obj_id, face) in enumerate(parts)]
+    return Picture(rgb, WINDOW, T_CAM_BOARD, annotations)
+
+
+def write_split(folder: Path, instances: list[list[tuple[int, int]]], jpeg: int | None = None) -> Path:
+    """A data set with one image per list of parts."""
+    return write_data_set(folder, "val", PARTS, [picture(i, parts) for i, parts in enumerate(instances)], jpeg)
 
 
 @pytest.fixture
@@ -132,14 +112,17 @@ def test_the_cache_gives_the_same_and_follows_the_manifest(split: Path) -> None:
     again = load_windows(split)
     np.testing.assert_array_equal(first.images, again.images)
     np.testing.assert_array_equal(first.T_cam_part, again.T_cam_part)
-    (split / "dataset.json").write_text(json.dumps({"split": "val", "count": 3, "seed": 2}))
+    (split / "manifest.json").write_text(json.dumps({"images": 3, "instances": {}}))
     with pytest.raises(PerceptionError, match="scene_gt"):
         load_windows(split)
 
 
 def test_a_data_set_without_manifest_or_unfinished_is_not_read(split: Path) -> None:
-    (split / "dataset.json").write_text(json.dumps({"split": "val", "count": 500}))
-    with pytest.raises(PerceptionError, match="holds 3 of its 500 images"):
+    (split / "manifest.json").write_text(json.dumps({"images": 500}))
+    with pytest.raises(PerceptionError, match="holds 3 of the 500 images"):
+        load_crops(split)
+    (split / "manifest.json").unlink()
+    with pytest.raises(PerceptionError, match="its rendering did not finish; run the same command again"):
         load_crops(split)
     (split / "dataset.json").unlink()
     with pytest.raises(PerceptionError, match=r"no dataset\.json in "):
@@ -168,6 +151,69 @@ def test_parts_and_faces_that_do_not_exist_are_named(split: Path) -> None:
     windows.stable_pose[0] = 7
     with pytest.raises(PerceptionError, match="stable pose 7 of block4, which has 2"):
         windows.labels(PARTS)
+
+
+def edit(path: Path, change: Callable[[Any], None]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def scaled(entry: dict[str, Any], key: str, factor: float) -> None:
+    entry[key] = [factor * x for x in entry[key]]
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1e-3, "seems to be in metres"), (1e3, "or was scaled twice")])
+def test_translations_in_another_unit_are_refused(split: Path, factor: float, says: str) -> None:
+    chunk = split / "val" / "000000"
+    edit(chunk / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", factor))
+    with pytest.raises(PerceptionError, match=rf"image 2 of .*cam_t_m2c.*{says}: BOP's unit is the millimetre"):
+        load_crops(split)
+    edit(chunk / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", 1 / factor))
+    edit(chunk / "scene_camera.json", lambda camera: scaled(camera["1"], "cam_t_w2c", factor))
+    with pytest.raises(PerceptionError, match=rf"image 1 of .*cam_t_w2c.*{says}"):
+        load_windows(split)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_models_in_another_unit_are_refused(split: Path, factor: float) -> None:
+    def change(models: dict[str, Any]) -> None:
+        models["9"]["diameter"] *= factor
+
+    edit(split / "models" / "models_info.json", change)
+    with pytest.raises(PerceptionError, match=r"diameter of part 9 is .*BOP's unit is the millimetre"):
+        load_crops(split)
+
+
+def test_a_lens_that_distorts_and_foreign_labels_are_refused(split: Path) -> None:
+    chunk = split / "val" / "000000"
+    edit(chunk / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0, 0, 0, 0]))
+    assert len(load_crops(split)) == 3
+    (split / "cache.npz").unlink()
+    edit(chunk / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0.01, 0, 0, 0]))
+    with pytest.raises(PerceptionError, match=r"image 0 .*lens that distorts"):
+        load_crops(split)
+    edit(chunk / "scene_camera.json", lambda camera: camera["0"].pop("cam_dist"))
+    edit(chunk / "scene_gt.json", lambda truth: truth["2"][0].pop("stable_pose"))
+    with pytest.raises(PerceptionError, match=r"image 2 .*no stable_pose"):
+        load_crops(split)
+
+
+def test_parts_of_which_nothing_is_seen_are_left_out(tmp_path: Path) -> None:
+    shown = picture(0, [(9, 0), (4, 1), (4, 0)])
+    hidden = shown.annotations[1]
+    shown.annotations[1] = replace(hidden, visible=np.zeros_like(hidden.visible))
+    windows = load_windows(write_data_set(tmp_path / "set", "test", PARTS, [shown]))
+    assert windows.obj_id.tolist() == [9, 4] and windows.instance.tolist() == [0, 1]
+    assert windows.stable_pose.tolist() == [0, 0]
+    assert windows.instance_map[0, 8, 0] == 1 and windows.instance_map[0, 8, 20] == 2
+    assert (windows.instance_map > 0).sum() == 50
+
+
+def test_jpeg_files_are_read(tmp_path: Path) -> None:
+    crops = load_crops(write_split(tmp_path / "set", [[(4, 1)], []], jpeg=95))
+    assert not list((tmp_path / "set").rglob("rgb/*.png"))
+    assert np.abs(crops.images[1].astype(int) - [11, 20, 30]).max() <= 3
 
 
 def test_camera_of_a_crop_is_the_crop_of_the_camera() -> None:

@@ -5,14 +5,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from data_sets import Picture, write_data_set
 
-from cad.spatial import BASLER
+from cad.parts import BUILT_IN, load_part
+from cad.spatial import BASLER, rotation_x, transform
 from perception.estimates import Frame, PerceptionError
 from perception.segmentation import DecodeConfig, Outputs, SegmentationNet, Segmenter, decode, normalise
 from perception.train import main
 from perception.train_segmentation import NO_CLASS, batch_of, examine, figures_of, focal, losses, targets_of
 from perception.training import seeded
 from perception.windows import Window, cut, filled, flip, paste, recolour, warp
+from scenes.bop import Annotation
 
 SIZE = 128
 
@@ -208,26 +211,18 @@ def test_figures_of_a_trained_network_on_new_windows(trained: SegmentationNet) -
 def write_windows(folder: Path, count: int) -> Path:
     """Drawn windows as a data set whose bars and discs pass for parts 1 and 2."""
     rng = np.random.default_rng(count)
-    chunk = folder / "train" / "000000"
-    for name in ("rgb", "mask_visib"):
-        (chunk / name).mkdir(parents=True)
-    camera, truth = {}, {}
-    for i in range(count):
+    camera = BASLER.downscaled(4).crop(600, 400, SIZE, SIZE)
+    T = transform(rotation_x(np.pi), [0.0, 0.0, 0.7])
+    pictures = []
+    for _ in range(count):
         window = draw(rng)
-        cv2.imwrite(str(chunk / "rgb" / f"{i:06d}.png"), window.image)
-        camera[str(i)] = {
-            "cam_K": BASLER.downscaled(4).crop(600, 400, SIZE, SIZE).matrix.ravel().tolist(),
-            "cam_R_w2c": [1, 0, 0, 0, -1, 0, 0, 0, -1],
-            "cam_t_w2c": [0, 0, 700],
-        }
-        pose = {"cam_R_m2c": [1, 0, 0, 0, -1, 0, 0, 0, -1], "cam_t_m2c": [0, 0, 700], "stable_pose": 0}
-        truth[str(i)] = [{"obj_id": int(c) + 1} | pose for c in window.classes]
-        for k in range(len(window.classes)):
-            cv2.imwrite(str(chunk / "mask_visib" / f"{i:06d}_{k:06d}.png"), (window.instances == k + 1) * np.uint8(255))
-    (chunk / "scene_camera.json").write_text(json.dumps(camera))
-    (chunk / "scene_gt.json").write_text(json.dumps(truth))
-    (folder / "dataset.json").write_text(json.dumps({"split": "train", "count": count}))
-    return folder
+        masks = [window.instances == k + 1 for k in range(len(window.classes))]
+        annotations = [
+            Annotation(obj_id=int(c) + 1, stable_pose=0, T_cam_part=T, corner=(0, 0), silhouette=mask, visible=mask)
+            for c, mask in zip(window.classes, masks, strict=True)
+        ]
+        pictures.append(Picture(window.image, camera, T, annotations))
+    return write_data_set(folder, "train", [load_part(name) for name in BUILT_IN], pictures)
 
 
 def test_training_from_the_command_line_leaves_weights_that_load(tmp_path: Path) -> None:

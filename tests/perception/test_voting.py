@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perception.voting import VotingError, offset_vote, ransac_vote
+from perception.voting import VotingError, offset_vote, ransac_vote, vector_field
 
 SHIFT = np.array([5.0, -3.0])
 
@@ -81,3 +81,18 @@ def test_too_few_pixels_and_wrong_shapes_are_named() -> None:
         offset_vote(np.zeros((5, 2)), np.ones((4, 1, 2)), np.zeros((4, 1)))
     with pytest.raises(VotingError, match="log_scale"):
         offset_vote(np.zeros((5, 2)), np.ones((5, 1, 2)), np.zeros((5, 2)))
+
+
+def test_the_vector_field_points_to_the_keypoints_it_was_made_of() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[10:30, 15:45] = True
+    keypoints = np.array([[20.25, 12.5], [44.0, 29.75], [70.0, -5.0], [18.0, 20.0]])
+    field = vector_field(mask, keypoints)
+    assert field.shape == (40, 60, 4, 2) and field.dtype == np.float32
+    assert not field[~mask].any() and not field[20, 18, 3].any()
+    np.testing.assert_allclose(field[12, 18, 0], np.array([2.25, 0.5]) / np.hypot(2.25, 0.5), atol=1e-6)
+    v, u = np.nonzero(mask)
+    found, _ = ransac_vote(np.stack([u, v], axis=-1), field[v, u], np.random.default_rng(0))
+    np.testing.assert_allclose(found, keypoints, atol=0.02)
+    with pytest.raises(VotingError, match=r"\(40, 60\) and keypoints \(8,\)"):
+        vector_field(mask, keypoints.ravel())
