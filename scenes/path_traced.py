@@ -1,0 +1,292 @@
+"""The path-traced domain: Mitsuba 3 behind the renderers' protocol (extra ``photoreal``).
+
+Light, materials and exposure are those of ``scenes.scene_export``; see ``scenes.photoreal`` for what it needs.
+"""
+
+from __future__ import annotations
+
+import zlib
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cad.spatial import Array, Intrinsics
+from scenes.camera import CAMERA, camera_pose
+from scenes.errors import SceneError
+from scenes.gl import mujoco
+from scenes.photoreal import load_mitsuba, mitsuba_problem
+from scenes.render import ALL, Rendering, What
+from scenes.scene_export import (
+    DrawnGeom,
+    DrawnLamp,
+    Finish,
+    SceneDescription,
+    SceneReader,
+    environment_panorama,
+    texture_image,
+)
+
+__all__ = ["MitsubaRenderer", "mitsuba_problem"]
+
+SAMPLES = 64
+MAX_DEPTH = 6
+GROUPS = 8
+STRIDE = 1_000_003
+SPECK_FACTOR, SPECK_LEVEL = 1.5, 0.1
+SAMPLES_AT_ONCE = 1 << 24
+"""Larger windows are drawn in bands of rows, which bounds the memory that a render takes."""
+SMOOTHEST = 0.03
+"""Roughness below which highlights of lamps would be too bright to average."""
+MM = 1000.0
+NEAR_M, FAR_M = 0.01, 100.0
+CAM_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Mitsuba's camera looks along +z with x to the left and y up."""
+NO_LAMP_RADIUS_M = 1e-6
+"""A lamp that is smaller than this is a point."""
+
+
+class MitsubaRenderer:
+    """Path tracing with ``samples`` a pixel (a power of 4 spreads them best) and a box filter, linear and not clipped.
+
+    Instances and depth are of pixel centres. The noise is drawn from ``seed`` and from what is rendered, so the same
+    scene through the same window gives the same bytes and another scene other noise. All surfaces cast shadows. Lamps
+    shine in all directions and are seen in reflections only, never by the camera; what no geom covers is black.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, *, max_width: int, max_height: int, samples: int = SAMPLES, seed: int = 0
+    ) -> None:
+        self._mi = load_mitsuba()
+        self._model, self._size = model, (max_width, max_height)
+        self._samples, self._seed = samples, seed
+        self._reader: SceneReader | None = SceneReader(model)
+        self._kept: dict[Any, Any] = {}
+        self._colours = self._mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
+        self._labels = self._mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
+
+    def render(
+        self,
+        data: mujoco.MjData,
+        intrinsics: Intrinsics,
+        what: tuple[What, ...] = ALL,
+        camera: str = CAMERA,
+    ) -> Rendering:
+        """See :class:`Renderer`. ``rgb`` is float32.
+
+        Raises SceneError for a window larger than the renderer was made for, or with unequal focal lengths.
+        """
+        if self._reader is None:
+            raise SceneError("this renderer was closed; make a new MitsubaRenderer")
+        check_window(intrinsics, self._size)
+        scene = self._reader.read(data)
+        view = _View(intrinsics, camera_pose(self._model, data, camera), scene)
+        used: dict[Any, Any] = {}
+        shapes = {f"geom_{geom.geom:05d}": self._shape(geom, view, used) for geom in scene.geoms}
+        rgb = instances = depth = None
+        if "rgb" in what:
+            lit = self._mi.load_dict({"type": "scene", **shapes, **self._lights(scene, view, used)})
+            rgb = self._draw_colours(lit, view)
+        if "instances" in what or "depth" in what:
+            bare = self._mi.load_dict({"type": "scene", **shapes})
+            drawn = self._draw(bare, self._labels, view, 1, 0)
+            geom = self._geom_order(bare)[drawn[..., 3].astype(np.int64)]
+            if "instances" in what:
+                instances = np.array([-1, *(shown.instance for shown in scene.geoms)], np.int16)[geom]
+            if "depth" in what:
+                far = self._model.vis.map.zfar * self._model.stat.extent
+                depth = np.where(geom > 0, view.depth_m(drawn[..., :3]), far).astype(np.float32)
+        self._kept = used
+        return Rendering(rgb=rgb, instances=instances, depth_m=depth)
+
+    def close(self) -> None:
+        """Forget the meshes; closing twice is harmless."""
+        self._reader = None
+        self._kept = {}
+
+    def __enter__(self) -> MitsubaRenderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _draw_colours(self, scene: Any, view: _View) -> NDArray[np.float32]:
+        """Grey levels (H, W, 3): the mean of several groups of samples, none of which may be far above their median.
+
+        A path that finds a lamp by way of a mirror is rare and bright; alone in its pixel it would be a white speck.
+        """
+        seed = zlib.crc32(view.signature(self._seed))
+        groups = min(GROUPS, self._samples)
+        drawn = [
+            self._draw(scene, self._colours, view, self._samples // groups, seed + STRIDE * k) for k in range(groups)
+        ]
+        levels = np.stack(drawn)
+        limit = SPECK_FACTOR * np.median(levels, axis=0) + SPECK_LEVEL
+        return 255 * np.minimum(levels, limit).mean(axis=0)
+
+    def _draw(self, scene: Any, integrator: Any, view: _View, samples: int, seed: int) -> NDArray[np.float32]:
+        """What an integrator makes of a scene, (H, W, channels), drawn in bands that fit into memory."""
+        whole = view.intrinsics
+        rows = max(1, SAMPLES_AT_ONCE // (whole.width * samples))
+        bands = []
+        for top in range(0, whole.height, rows):
+            band = whole.crop(0, top, whole.width, min(rows, whole.height - top))
+            sensor = self._mi.load_dict(view.sensor(self._mi, band, samples))
+            noise = (seed + top) % 2**32
+            drawn = self._mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=noise)
+            bands.append(np.array(drawn, np.float32))
+        return np.concatenate(bands)
+
+    def _geom_order(self, scene: Any) -> NDArray[np.int64]:
+        """Index by a shape's number in an image; gives 1 + the place of its geom among the drawn ones, 0 for none."""
+        shapes = scene.shapes()
+        if self._mi.variant().startswith("scalar"):
+            numbers = np.arange(1, len(shapes) + 1)
+        else:
+            reinterpret = import_module("drjit").reinterpret_array
+            numbers = np.array(reinterpret(self._mi.UInt32, scene.shapes_dr()), np.int64)
+        order = np.zeros(numbers.max(initial=0) + 1, np.int64)
+        ids = [shape.id() for shape in shapes]
+        order[numbers] = np.argsort(np.argsort(ids)) + 1
+        return order
+
+    def _shape(self, geom: DrawnGeom, view: _View, used: dict[Any, Any]) -> Any:
+        finish = geom.finish
+        if finish not in used:
+            used[finish] = self._kept.get(finish) or self._surface(finish)
+        drawn = geom.mesh
+        properties = self._mi.Properties()
+        properties["bsdf"] = used[finish]
+        mesh = self._mi.Mesh(
+            geom.name,
+            vertex_count=len(drawn.vertices),
+            face_count=len(drawn.faces),
+            has_vertex_normals=True,
+            has_vertex_texcoords=drawn.texcoords is not None,
+            props=properties,
+        )
+        arrays = self._mi.traverse(mesh)
+        arrays["vertex_positions"] = view.local(geom.world_vertices).astype(np.float32).ravel()
+        arrays["vertex_normals"] = geom.world_normals.astype(np.float32).ravel()
+        arrays["faces"] = drawn.faces.astype(np.uint32).ravel()
+        if drawn.texcoords is not None:
+            arrays["vertex_texcoords"] = (drawn.texcoords * np.array(finish.repeat, np.float32)).ravel()
+        arrays.update()
+        return mesh
+
+    def _surface(self, finish: Finish) -> Any:
+        """A BSDF, seen from both sides."""
+        colour: dict[str, Any] = {"type": "rgb", "value": list(np.clip(finish.rgb, 0, 1))}
+        if finish.texture >= 0:
+            image = np.clip(texture_image(self._model, finish.texture) * np.array(finish.rgb, np.float32), 0, 1)
+            colour = {"type": "bitmap", "bitmap": self._mi.Bitmap(image), "raw": True}
+        surface = {
+            "type": "principled",
+            "base_color": colour,
+            "metallic": finish.metallic,
+            "roughness": max(finish.roughness, SMOOTHEST),
+        }
+        return self._mi.load_dict({"type": "twosided", "surface": surface})
+
+    def _lights(self, scene: SceneDescription, view: _View, used: dict[Any, Any]) -> dict[str, Any]:
+        lights: dict[str, Any] = {lamp.name: _lamp(self._mi, lamp, view) for lamp in scene.lamps if any(lamp.rgb)}
+        if scene.environment >= 0:
+            key = (scene.environment, scene.environment_radiance)
+            used[key] = self._kept.get(key) or self._environment(*key)
+            lights["environment"] = used[key]
+        elif any(scene.ambient):
+            lights["environment"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(scene.ambient)}}
+        return lights
+
+    def _environment(self, texture: int, radiance: float) -> Any:
+        upright = self._mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+        panorama = self._mi.Bitmap(environment_panorama(self._model, texture))
+        return self._mi.load_dict({"type": "envmap", "bitmap": panorama, "scale": radiance, "to_world": upright})
+
+
+class _View:
+    """A window of a camera, and the frame that Mitsuba works in: millimetres from where the window looks.
+
+    Mitsuba leaves a gap of 1e-4 of a point's coordinates between a surface and the rays that start there; so far from
+    the origin or in metres, small parts would lose their shadows.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, T_world_cam: Array, scene: SceneDescription) -> None:
+        self.intrinsics = intrinsics
+        self._T_world_cam = T_world_cam
+        middle = [(intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2]
+        ray = T_world_cam[:3, :3] @ intrinsics.rays(middle)
+        parts = [geom for geom in scene.geoms if geom.instance >= 0] or scene.geoms
+        away = [(geom.T_world_geom[:3, 3] - T_world_cam[:3, 3]) @ T_world_cam[:3, 2] for geom in parts]
+        self._origin = T_world_cam[:3, 3] + ray * (np.median(away) if away else 1.0)
+        self._moved = np.concatenate([geom.T_world_geom for geom in scene.geoms]) if scene.geoms else np.zeros((4, 4))
+
+    def signature(self, seed: int) -> bytes:
+        """Differs where the seed, the window, the camera or anything's pose differs."""
+        i = self.intrinsics
+        head = [seed, i.width, i.height, i.fx, i.cx, i.cy]
+        return np.concatenate([head, self._T_world_cam.ravel(), self._moved.ravel()]).tobytes()
+
+    def local(self, points: Array) -> Array:
+        """World points (..., 3) in metres to Mitsuba's frame."""
+        return (points - self._origin) * MM
+
+    def depth_m(self, local: NDArray[np.float32]) -> Array:
+        """Metres along the camera's z of points (..., 3) in Mitsuba's frame."""
+        return (local.astype(np.float64) / MM + self._origin - self._T_world_cam[:3, 3]) @ self._T_world_cam[:3, 2]
+
+    def sensor(self, mi: ModuleType, window: Intrinsics, samples: int) -> dict[str, Any]:
+        """The camera through ``window``; one sample is that of the pixel's centre."""
+        width, height = window.width, window.height
+        T_local_cam = self._T_world_cam @ CAM_FROM_MITSUBA
+        T_local_cam[:3, 3] = self.local(T_local_cam[:3, 3])
+        return {
+            "type": "perspective",
+            "fov_axis": "x",
+            "fov": float(2 * np.degrees(np.arctan(width / (2 * window.fx)))),
+            "principal_point_offset_x": ((width - 1) / 2 - window.cx) / width,
+            "principal_point_offset_y": ((height - 1) / 2 - window.cy) / height,
+            "near_clip": NEAR_M * MM,
+            "far_clip": FAR_M * MM,
+            "to_world": mi.ScalarTransform4f(T_local_cam),
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
+            },
+            "sampler": {"type": "multijitter", "sample_count": samples, "jitter": samples > 1},
+        }
+
+
+def check_window(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
+    """Raise SceneError for a window that is larger than ``size`` (width, height) or whose pixels are not square."""
+    width, height = intrinsics.width, intrinsics.height
+    if width > size[0] or height > size[1]:
+        raise SceneError(
+            f"a window of {width} x {height} does not fit into this renderer's {size[0]} x {size[1]}; "
+            "make the renderer with a larger max_width and max_height"
+        )
+    if abs(intrinsics.fx / intrinsics.fy - 1) > 1e-6:
+        raise SceneError(
+            f"focal lengths {intrinsics.fx} and {intrinsics.fy} differ; the mitsuba domain draws square pixels only, "
+            "use one focal length or the classic domain"
+        )
+
+
+def _lamp(mi: ModuleType, lamp: DrawnLamp, view: _View) -> dict[str, Any]:
+    """A far lamp, or a ball or point that shines alike in all directions."""
+    rgb = np.array(lamp.rgb)
+    if lamp.kind == "directional":
+        irradiance = {"type": "rgb", "value": list(np.pi * rgb)}
+        return {"type": "directional", "direction": list(lamp.direction), "irradiance": irradiance}
+    position = [float(x) for x in view.local(lamp.position)]
+    if lamp.radius_m < NO_LAMP_RADIUS_M:
+        return {"type": "point", "position": position, "intensity": {"type": "rgb", "value": list(np.pi * rgb * MM**2)}}
+    radiance = {"type": "rgb", "value": list(rgb / lamp.radius_m**2)}
+    emitter = {"type": "area", "radiance": radiance}
+    return {"type": "sphere", "center": position, "radius": lamp.radius_m * MM, "emitter": emitter}
