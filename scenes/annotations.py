@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 from cad.spatial import Array, Intrinsics, apply, inverse, transform
 from scenes.bop import Annotation
 from scenes.gl import mujoco
+from scenes.lens import STRAIGHT, Lens
 from scenes.render import HIDDEN_GROUP, Rendering
 from scenes.shots import Shot
 from scenes.stage import Stage
@@ -46,6 +47,7 @@ class Labeller:
                 continue
             corner, silhouette, visible = found
             part, T_cam_part = self._stage.part(placed.name), T_cam_board @ placed.T_board_object
+            keypoints = apply(T_cam_part, part.keypoints)
             annotations.append(
                 Annotation(
                     obj_id=part.obj_id,
@@ -54,7 +56,7 @@ class Labeller:
                     corner=corner,
                     silhouette=silhouette,
                     visible=visible,
-                    keypoints=seen_keypoints(apply(T_cam_part, part.keypoints), camera, drawn.depth_m),
+                    keypoints=seen_keypoints(keypoints, camera, drawn.depth_m, self._stage.lens),
                 )
             )
         return annotations
@@ -108,7 +110,8 @@ class Labeller:
         """The convex outline (N, 2) of a geom in pixels, clockwise."""
         data = self._stage.data
         T_board_geom = transform(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom])
-        pixels = camera.project(apply(T_cam_board @ T_board_geom, self._hull(geom))).astype(np.float32)
+        points = apply(T_cam_board @ T_board_geom, self._hull(geom))
+        pixels = self._stage.lens.project(camera, points).astype(np.float32)
         return np.asarray(cv2.convexHull(pixels)[:, 0], np.float32)
 
     def _hull(self, geom: int) -> Array:
@@ -126,12 +129,12 @@ class Labeller:
         return self._hulls[key]
 
 
-def seen_keypoints(p_cam: Array, camera: Intrinsics, depth_m: NDArray[np.float32]) -> Array:
+def seen_keypoints(p_cam: Array, camera: Intrinsics, depth_m: NDArray[np.float32], lens: Lens = STRAIGHT) -> Array:
     """(K, 3) pixel u, v, and 2 where a keypoint (K, 3) in ``cam`` is seen, 1 where it is hidden or beyond the image.
 
     It is seen where the depth in one of the four pixels round it is not less than its own.
     """
-    pixels = camera.project(p_cam)
+    pixels = lens.project(camera, p_cam)
     height, width = depth_m.shape
     inside = ((pixels >= -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=1)
     near = np.floor(pixels).astype(np.int64)

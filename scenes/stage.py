@@ -15,15 +15,29 @@ from cad.parts import Part
 from cad.spatial import BASLER, Array, Intrinsics, quat_wxyz_from_rotation
 from cad.tagboard import TagboardConfig
 from scenes.camera import add_camera, set_camera_pose
+from scenes.distorted import DistortedRenderer
 from scenes.distractors import distractor_meshes
 from scenes.domains import Domain, make_renderer
 from scenes.gl import mujoco
-from scenes.look import add_board_visuals, add_material, add_mesh, add_texture, add_visual, classic_finish
-from scenes.randomize import LIGHTS, Look, LookRanges, Surface, draw_distractor_surface, draw_part_surface
+from scenes.lens import Lens
+from scenes.look import (
+    MATT_SHININESS,
+    MATT_SPECULAR,
+    add_board_visuals,
+    add_material,
+    add_mesh,
+    add_texture,
+    add_visual,
+)
+from scenes.randomize import LIGHTS, Look, draw_distractor_surface, draw_part_surface
+from scenes.ranges import LookRanges
 from scenes.render import HIDDEN_GROUP, Rendering, What
 from scenes.shots import Placed, Shot
+from scenes.textures import worn
 
 LIGHT_DISTANCE_M = 0.5
+BOARD_ASPECT = 0.6875
+"""Height of the board over its width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,22 +65,23 @@ class Stage:
         *,
         domain: Domain = "classic",
         environments: Sequence[NDArray[np.uint8]] = (),
+        wear: Sequence[NDArray[np.uint8]] = (),
         board: TagboardConfig | None = None,
     ) -> None:
         self._parts = {part.name: part for part in parts}
-        self._textures = len(textures)
         self._slots = config.slots
-        spec = _build(parts, textures, config, board or TagboardConfig())
+        spec = _build(parts, textures, wear, config, board or TagboardConfig())
         _add_lamps(spec)
         if domain != "classic":
             _add_environments(spec, environments)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        self._find(len(textures), len(wear))
         self._first_slot = {part.name: k * config.slots for k, part in enumerate(parts)}
-        self._distractors = distractor_meshes().keys()
         self._shown: list[int] = []
         width, height = config.max_size
-        self._renderer = make_renderer(domain, self.model, max_width=width, max_height=height)
+        renderer = make_renderer(domain, self.model, max_width=width, max_height=height)
+        self._renderer = DistortedRenderer(renderer, max_width=width, max_height=height)
 
     def arrange(self, shot: Shot) -> NDArray[np.int16]:
         """Put camera, parts and distractors where the shot says; returns the instance index of each part (N,).
@@ -97,29 +112,39 @@ class Stage:
         """Set lamps, plate, tags and the surfaces of everything shown."""
         model = self.model
         self._light(look, shot.focus_board)
-        board = model.geom("board_visual").id
-        material = model.material("board" if look.texture < 0 else f"plate_{look.texture:02d}").id
-        model.geom_matid[board] = material
-        model.mat_rgba[material, :3] = look.board_rgb
-        model.mat_texrepeat[material] = [look.texture_repeat, look.texture_repeat * 0.6875]
-        model.mat_rgba[model.material("tags").id, :3] = look.tag_level
-        model.mat_rgba[model.material("surroundings").id, :3] = look.surroundings_level
+        plate = self._plates[look.texture]
+        model.geom_matid[self._board] = plate
+        model.mat_rgba[plate, :3] = look.board_rgb
+        model.mat_roughness[plate] = look.board_roughness
+        if look.texture >= 0:
+            model.mat_texrepeat[plate] = [look.texture_repeat, look.texture_repeat * BOARD_ASPECT]
+        tags = self._tags[look.worn]
+        model.geom_matid[self._labels] = tags
+        model.mat_rgba[tags, :3] = look.tag_level
+        model.mat_rgba[self._surroundings, :3] = look.surroundings_level
         for geom in self._shown:
-            owner = model.geom(geom).name.removesuffix("_visual")
-            if owner.startswith("part_"):
-                part = self._part_of(owner)
-                specular, shininess = classic_finish(part.metallic, part.roughness)
-                nominal = Surface(rgb=part.rgba[:3], specular=specular, shininess=shininess)
-                surface = draw_part_surface(ranges, nominal, part.metallic > 0.5, look.default, rng)
-            else:
+            part = self._part_of_geom.get(geom)
+            if part is None:
                 surface = draw_distractor_surface(ranges, rng)
+            else:
+                surface = draw_part_surface(ranges, part, look.default, rng)
             k = model.geom_matid[geom]
             model.mat_rgba[k, :3] = surface.rgb
+            model.mat_metallic[k], model.mat_roughness[k] = surface.metallic, surface.roughness
             model.mat_specular[k], model.mat_shininess[k] = surface.specular, surface.shininess
 
     def render(self, intrinsics: Intrinsics, what: tuple[What, ...]) -> Rendering:
         """Draw what was arranged through a window."""
         return self._renderer.render(self.data, intrinsics, what)
+
+    @property
+    def lens(self) -> Lens:
+        """The lens that everything is seen through; one that does not distort unless another is set."""
+        return self._renderer.lens
+
+    @lens.setter
+    def lens(self, lens: Lens) -> None:
+        self._renderer.lens = lens
 
     def part(self, name: str) -> Part:
         """One of the parts that the stage can show."""
@@ -134,8 +159,15 @@ class Stage:
         """Free the renderer."""
         self._renderer.close()
 
-    def _part_of(self, body: str) -> Part:
-        return list(self._parts.values())[int(body.removeprefix("part_")) // self._slots]
+    def _find(self, textures: int, wear: int) -> None:
+        """Look up what is dressed: the last of the plates, and of the tags, is the plain one, at index -1."""
+        model = self.model
+        self._board, self._labels = model.geom("board_visual").id, model.geom("tags_visual").id
+        self._plates = [model.material(name).id for name in [*(f"plate_{k:02d}" for k in range(textures)), "board"]]
+        self._tags = [model.material(name).id for name in [*(f"tags_{k:02d}" for k in range(wear)), "tags"]]
+        self._surroundings = model.material("surroundings").id
+        slots = [part for part in self._parts.values() for _ in range(self._slots)]
+        self._part_of_geom = {model.geom(f"part_{i:02d}_visual").id: part for i, part in enumerate(slots)}
 
     def _show(self, body: str, placed: Placed) -> None:
         model = self.model
@@ -163,7 +195,11 @@ class Stage:
 
 
 def _build(
-    parts: Sequence[Part], textures: Sequence[NDArray[np.uint8]], config: StageConfig, board: TagboardConfig
+    parts: Sequence[Part],
+    textures: Sequence[NDArray[np.uint8]],
+    wear: Sequence[NDArray[np.uint8]],
+    config: StageConfig,
+    board: TagboardConfig,
 ) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "stage"
@@ -179,8 +215,11 @@ def _build(
     table.pos, table.material, table.group = [0.0, 0.0, -board.thickness_m - 0.01], "surroundings", 1
     table.castshadow = False
     for k, texture in enumerate(textures):
-        add_texture(spec, f"plate_{k:02d}", texture)
-        add_material(spec, f"plate_{k:02d}", (1, 1, 1, 1), specular=0.05, shininess=0.1, texture=f"plate_{k:02d}")
+        _add_matt(spec, f"plate_{k:02d}", texture)
+    clean = _image_of(spec.texture("tags")) if wear else None
+    for k, layer in enumerate(wear):
+        assert clean is not None
+        _add_matt(spec, f"tags_{k:02d}", worn(clean, layer))
     for k, part in enumerate(parts):
         add_mesh(spec, f"{part.name}_visual", part.mesh)
         for slot in range(k * config.slots, (k + 1) * config.slots):
@@ -206,6 +245,16 @@ def _add_environments(spec: mujoco.MjSpec, environments: Sequence[NDArray[np.uin
         texture.data = np.ascontiguousarray(faces).tobytes()
         light = spec.worldbody.add_light(name=name, type=mujoco.mjtLightType.mjLIGHT_IMAGE, texture=name)
         light.intensity, light.active = 8000.0, k == 0
+
+
+def _add_matt(spec: mujoco.MjSpec, name: str, image: NDArray[np.uint8]) -> None:
+    """A texture and the matt material that shows it."""
+    add_texture(spec, name, image)
+    add_material(spec, name, (1, 1, 1, 1), specular=MATT_SPECULAR, shininess=MATT_SHININESS, texture=name)
+
+
+def _image_of(texture: mujoco.MjsTexture) -> NDArray[np.uint8]:
+    return np.frombuffer(texture.data, np.uint8).reshape(texture.height, texture.width, texture.nchannel)
 
 
 def _add_slot(spec: mujoco.MjSpec, name: str, mesh: str) -> None:

@@ -1,4 +1,4 @@
-"""Procedural backgrounds for the tagboard: what a plate may be made of or covered with."""
+"""Procedural backgrounds for the tagboard, what a plate may be made of or covered with, and the wear of its face."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
 SIZE = 512
+WORN_SHARE = 0.4
+"""Share of the textures that show wear."""
 
 
 def make_textures(rng: np.random.Generator, count: int) -> list[NDArray[np.uint8]]:
@@ -20,13 +22,60 @@ def make_textures(rng: np.random.Generator, count: int) -> list[NDArray[np.uint8
     return [_finish(KINDS[i % len(KINDS)](rng), rng) for i in range(count)]
 
 
+def make_wear(rng: np.random.Generator, count: int) -> list[NDArray[np.uint8]]:
+    """``count`` layers of wear (512, 512, 4) uint8, colour and coverage: fading, stains, scratches, worn off spots."""
+    layers = []
+    for _ in range(count):
+        colour, cover = np.zeros((SIZE, SIZE, 3), np.float32), np.zeros((SIZE, SIZE), np.float32)
+        faded = rng.uniform(0.05, 0.35) * (1 + 0.5 * np.clip(_noise(rng, (5, 5)), -1, 1))
+        _lay(colour, cover, faded, _paper(rng))
+        for _ in range(int(rng.integers(0, 5))):
+            _lay(colour, cover, rng.uniform(0.1, 0.5) * _stain(rng), rng.uniform(20, 140) * rng.uniform(0.6, 1, 3))
+        scratches = rng.uniform(0.3, 0.9) * np.clip(np.abs(_scratches(rng)), 0, 1)
+        _lay(colour, cover, scratches, rng.uniform(60, 235) * rng.uniform(0.9, 1.0, 3))
+        _lay(colour, cover, (_noise(rng, (120, 120)) > rng.uniform(2.4, 3.5)).astype(np.float32), _paper(rng))
+        layers.append(np.dstack([np.clip(colour, 0, 255), 255 * cover]).astype(np.uint8))
+    return layers
+
+
+def worn(image: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image (H, W, 3) under a layer of wear, stretched over it."""
+    over = cv2.resize(layer, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+    cover = over[..., 3:].astype(np.float32) / 255
+    return (image + cover * (over[..., :3] - image.astype(np.float32)) + 0.5).astype(np.uint8)
+
+
+def _lay(colour: Image, cover: Image, mask: NDArray[np.floating], rgb: NDArray[np.float64]) -> None:
+    """Add one more layer on top, of one colour: straight, not premultiplied, alpha."""
+    mask = np.clip(mask, 0, 1)
+    total = mask + cover * (1 - mask)
+    share = (mask / np.maximum(total, 1e-6))[..., None]
+    colour += share * (np.asarray(rgb, np.float32) - colour)
+    cover[:] = total
+
+
+def _paper(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Bleached or yellowed paper."""
+    return rng.uniform(150, 240) * np.array([1.0, rng.uniform(0.94, 1.0), rng.uniform(0.8, 1.0)])
+
+
+def _stain(rng: np.random.Generator) -> Image:
+    """A blot with a ragged, darker rim."""
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
+    centre, radius = rng.uniform(0, SIZE, 2), rng.uniform(15, 90)
+    distance = np.hypot(x - centre[0], y - centre[1]) / radius + 0.25 * _noise(rng, (9, 9))
+    rim = np.exp(-(((distance - 0.92) / 0.07) ** 2))
+    return (0.6 / (1 + np.exp(20 * (distance - 1))) + 0.4 * rim).astype(np.float32)
+
+
 def _finish(pattern: Image, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Pattern (512, 512) or (512, 512, 3) of about zero mean and unit range to grey levels, with a little grain."""
     if pattern.ndim == 2:
         pattern = np.repeat(pattern[..., None], 3, axis=2)
     contrast, grain = rng.uniform(8, 55), rng.uniform(0, 5)
     levels = 200 + contrast * pattern + grain * rng.standard_normal(pattern.shape, dtype=np.float32)
-    return np.clip(levels, 0, 255).astype(np.uint8)
+    image = np.clip(levels, 0, 255).astype(np.uint8)
+    return worn(image, make_wear(rng, 1)[0]) if rng.random() < WORN_SHARE else image
 
 
 def _noise(rng: np.random.Generator, cells: tuple[int, int]) -> Image:
