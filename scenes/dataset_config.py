@@ -11,12 +11,11 @@ from cad.parts import BUILT_IN, Part, load_part
 from cad.spatial import BASLER, Intrinsics
 from scenes.domains import DOMAINS, Domain
 from scenes.errors import SceneError
-from scenes.randomize import LookRanges
-from scenes.shots import ShotRanges
+from scenes.ranges import LOOKS, VIEWS, LensRanges, LookRanges, SensorRanges, Split, ViewRanges
+from scenes.rests import Faces
+from scenes.shots import SHOTS, ShotRanges
 
 Kind = Literal["crop", "window", "scene"]
-Split = Literal["train", "val", "test"]
-Faces = Literal["physics", "uniform"]
 
 SIZES: dict[Kind, tuple[int, int]] = {"crop": (256, 256), "window": (320, 320), "scene": (2208, 1242)}
 DOWNSCALES: dict[Kind, int] = {"crop": 1, "window": 4}
@@ -55,8 +54,11 @@ class DatasetConfig:
     jpeg: int | None = None
     parts: tuple[str, ...] = ()
     parts_dir: Path | None = None
-    look: LookRanges = field(default_factory=LookRanges)
-    shots: ShotRanges = field(default_factory=ShotRanges)
+    look: LookRanges | None = None
+    shots: ShotRanges | None = None
+    view: ViewRanges | None = None
+    sensor: SensorRanges = field(default_factory=SensorRanges)
+    lens: LensRanges = field(default_factory=LensRanges)
 
     def __post_init__(self) -> None:
         _check_choice("kind", self.kind, get_args(Kind))
@@ -118,6 +120,21 @@ class DatasetConfig:
         )
 
     @property
+    def look_ranges(self) -> LookRanges:
+        """What light, materials and board vary in: what was asked for, or the split's own."""
+        return self.look or LOOKS[self.split]
+
+    @property
+    def shot_ranges(self) -> ShotRanges:
+        """What lies where: what was asked for, or the split's own."""
+        return self.shots or SHOTS[self.split]
+
+    @property
+    def view_ranges(self) -> ViewRanges:
+        """Where the camera is: what was asked for, or the split's own."""
+        return self.view or VIEWS[self.split]
+
+    @property
     def shard_size(self) -> int:
         """Images a shard."""
         return self.shard or SHARDS[self.domain][self.kind]
@@ -129,6 +146,8 @@ class DatasetConfig:
     def manifest(self) -> str:
         """The config as JSON, with the hashes of the parts' meshes: the data set's identity."""
         content: dict[str, Any] = asdict(self)
+        content |= {"look": asdict(self.look_ranges), "shots": asdict(self.shot_ranges)}
+        content |= {"view": asdict(self.view_ranges)}
         content |= {"size": self.pixels, "downscale": self.scale_down, "shard": self.shard_size}
         content["parts"] = {part.name: part.mesh_hash for part in self.load_parts()}
         del content["parts_dir"]

@@ -81,17 +81,22 @@ def drop_part(
     pieces: Sequence[trimesh.Trimesh],
     config: DropsConfig | None = None,
     progress: Callable[[float], None] = lambda done: None,
+    R_start: Array | None = None,
 ) -> Drops:
     """Drop ``part``, whose convex ``pieces`` touch the table, ``config.drops`` times.
 
-    ``progress`` is told the share of the drops that are over. The result depends on the seed, not on the threads.
-    Raises SceneError for a part without pieces.
+    ``R_start`` (N, 3, 3) are the orientations ``R_table_part`` to fall in; they are drawn from the seed where it is
+    left out. ``progress`` is told the share of the drops that are over. The result depends on the seed, not on the
+    threads. Raises SceneError for a part without pieces and for another number of orientations than drops.
     """
     config = config or DropsConfig()
     if not pieces:
         raise SceneError(f"part {part.name!r} has no convex pieces to lie on (hulls/ in {part.folder}); add it again")
+    R = _any_orientation(config) if R_start is None else R_start
+    if R.shape != (config.drops, 3, 3):
+        raise SceneError(f"R_start has shape {R.shape}; {config.drops} drops need ({config.drops}, 3, 3)")
     model = _model(part, pieces, config)
-    state = _starts(part, model, config)
+    state = _starts(part, model, R, config)
     workers = [mujoco.MjData(model) for _ in range(config.threads)]
     steps = round(config.stage_s / config.timestep_s)
     still = np.zeros(config.drops, dtype=bool)
@@ -129,10 +134,12 @@ def _travel(values: Array) -> tuple[Array, Array]:
     return largest, np.linalg.norm(values[:, half:].mean(axis=1) - values[:, :half].mean(axis=1), axis=-1)
 
 
-def _starts(part: Part, model: mujoco.MjModel, config: DropsConfig) -> Array:
-    """(N, 14) time, position, quaternion and velocity of parts about to touch the table."""
-    rng = np.random.default_rng(config.seed)
-    R = Rotation.random(config.drops, rng=rng).as_matrix()
+def _any_orientation(config: DropsConfig) -> Array:
+    return Rotation.random(config.drops, rng=np.random.default_rng(config.seed)).as_matrix()
+
+
+def _starts(part: Part, model: mujoco.MjModel, R: Array, config: DropsConfig) -> Array:
+    """(N, 14) time, position, quaternion and velocity of parts about to touch the table, turned by ``R`` (N, 3, 3)."""
     lowest = (R[:, 2] @ np.asarray(part.mesh.convex_hull.vertices).T).min(axis=1)
     start = np.zeros((config.drops, 1 + model.nq + model.nv))
     start[:, 3] = _CLEARANCE_M - lowest

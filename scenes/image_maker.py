@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +12,16 @@ from cad.spatial import Array, Intrinsics, inverse
 from scenes.annotations import Labeller
 from scenes.bop import Annotation
 from scenes.dataset_config import DatasetConfig, Split
-from scenes.distractors import distractor_meshes
-from scenes.randomize import draw_look, draw_sensor
-from scenes.sensor import expose
+from scenes.environments import make_environments
+from scenes.lens import Lens
+from scenes.randomize import draw_lens, draw_look, draw_sensor
+from scenes.rests import RestPool
+from scenes.sensor import brightest, expose, mosaic_phase
 from scenes.shots import Shot, ShotSampler
 from scenes.stage import Stage, StageConfig
-from scenes.textures import make_textures
+from scenes.textures import make_textures, make_wear
 
-TEXTURES = 36
+TEXTURES, ENVIRONMENTS, WORN_TAGS = 36, 12, 3
 STREAMS: dict[Split, int] = {"train": 101, "val": 202, "test": 303}
 """First word of every seed of a split: no two splits share a shot, a background or an environment."""
 FULL_MARGIN_PX = 160
@@ -27,10 +30,15 @@ FULL_MARGIN_PX = 160
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledImage:
-    """An image (H, W, 3) uint8 with its camera, its parts and, where asked for, the distance seen in each pixel."""
+    """An image (H, W, 3) uint8 with its camera, its parts and, where asked for, the distance seen in each pixel.
+
+    ``gamma`` is the camera's: grey levels are linear in light where it is 1.
+    """
 
     image: NDArray[np.uint8]
     intrinsics: Intrinsics
+    lens: Lens
+    gamma: float
     T_cam_board: Array
     annotations: list[Annotation]
     depth_m: NDArray[np.float32] | None
@@ -40,17 +48,25 @@ class ImageMaker:
     """Makes the images of one data set in any order; holds the compiled stage. Close it when done.
 
     Image ``index`` depends on the config and on ``index`` only. Its shot, its look and its sensor have streams of
-    their own, so what is seen where is the same in every domain.
+    their own, so what is seen where is the same in every domain. How parts rest is kept in ``folder``, for the next one
+    who makes images of the same data set; without it, parts are dropped anew (a few seconds).
     """
 
-    def __init__(self, config: DatasetConfig) -> None:
+    def __init__(self, config: DatasetConfig, folder: Path | None = None) -> None:
         self._config = config
         parts = config.load_parts()
-        textures = make_textures(np.random.default_rng(STREAMS[config.split]), TEXTURES)
-        self._stage = Stage(parts, textures, stage_config(config), domain=config.domain)
+        streams = [np.random.default_rng([STREAMS[config.split], kind]) for kind in range(3)]
+        self._stage = Stage(
+            parts,
+            make_textures(streams[0], TEXTURES),
+            stage_config(config),
+            domain=config.domain,
+            environments=make_environments(streams[1], 0 if config.domain == "classic" else ENVIRONMENTS),
+            wear=make_wear(streams[2], WORN_TAGS),
+        )
         self._labeller = Labeller(self._stage)
-        radii = {n: float(np.linalg.norm(m.vertices[:, :2], axis=1).max()) for n, m in distractor_meshes().items()}
-        self._sampler = ShotSampler(parts, radii, config.shots)
+        rests = RestPool.make(parts) if folder is None else RestPool.load_or_make(parts, folder)
+        self._sampler = ShotSampler(rests, config.shot_ranges, config.view_ranges, config.faces)
 
     def make(self, index: int) -> LabelledImage:
         """Image number ``index``."""
@@ -59,15 +75,18 @@ class ImageMaker:
         shot_rng, look_rng, sensor_rng = (np.random.default_rng(seed) for seed in seeds)
         shot = self._shot(shot_rng)
         instances = stage.arrange(shot)
-        look = draw_look(config.look, TEXTURES, look_rng)
-        stage.dress(shot, look, config.look, look_rng)
+        stage.lens = lens = draw_lens(config.lens, sensor_rng)
+        ranges = config.look_ranges
+        look = draw_look(ranges, TEXTURES, look_rng, environments=ENVIRONMENTS, worn=WORN_TAGS)
+        stage.dress(shot, look, ranges, look_rng)
         drawn = stage.render(shot.intrinsics, ("rgb", "instances", "depth"))
         assert drawn.rgb is not None and drawn.instances is not None
-        brightest = float(np.percentile(drawn.rgb[::4, ::4], 98))
-        sensor = draw_sensor(config.look, brightest, sensor_rng)
+        sensor = draw_sensor(config.sensor, brightest(drawn.rgb), sensor_rng)
         return LabelledImage(
-            image=expose(drawn.rgb, sensor, sensor_rng, shot.downscale),
+            image=expose(drawn.rgb, sensor, sensor_rng, shot.downscale, mosaic_phase(shot.intrinsics)),
             intrinsics=shot.intrinsics,
+            lens=lens,
+            gamma=sensor.gamma,
             T_cam_board=inverse(shot.T_board_cam),
             annotations=self._labeller.label(shot, instances, drawn),
             depth_m=drawn.depth_m if config.depth else None,
@@ -91,8 +110,11 @@ def stage_config(config: DatasetConfig) -> StageConfig:
     width, height = config.pixels
     margin = 2 * int(np.ceil(FULL_MARGIN_PX / config.scale_down))
     size = (width + margin, height + margin)
+    slots = config.shot_ranges.most_parts(config.kind)
     if config.kind == "scene":
-        return StageConfig(slots=16, max_size=size, shadow_half_m=0.2, shadow_size=4096)
+        return StageConfig(slots=slots, max_size=size, shadow_half_m=0.2, shadow_size=4096)
     if config.kind == "window":
-        return StageConfig(slots=8, max_size=size, shadow_half_m=0.07, shadow_size=1024)
-    return StageConfig(slots=4, max_size=size, shadow_half_m=0.025, shadow_size=512 if config.scale_down > 1 else 1024)
+        return StageConfig(slots=slots, max_size=size, shadow_half_m=0.07, shadow_size=1024)
+    return StageConfig(
+        slots=slots, max_size=size, shadow_half_m=0.025, shadow_size=512 if config.scale_down > 1 else 1024
+    )
