@@ -44,6 +44,7 @@ MM = 1000.0
 NEAR_M, FAR_M = 0.01, 100.0
 CAM_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's camera looks along +z with x to the left and y up."""
+PARALLEL_M = 100.0
 NO_LAMP_RADIUS_M = 1e-6
 """A lamp that is smaller than this is a point."""
 
@@ -118,7 +119,7 @@ class MitsubaRenderer:
         A path that finds a lamp by way of a mirror is rare and bright; alone in its pixel it would be a white speck.
         """
         seed = zlib.crc32(view.signature(self._seed))
-        groups = min(GROUPS, self._samples)
+        groups = max(1, min(GROUPS, self._samples // GROUPS))
         drawn = [
             self._draw(scene, self._colours, view, self._samples // groups, seed + STRIDE * k) for k in range(groups)
         ]
@@ -209,6 +210,8 @@ class MitsubaRenderer:
 class _View:
     """A window of a camera, and the frame that Mitsuba works in: millimetres from where the window looks.
 
+    ``parts`` (3,) is the middle of the parts in the world, or of everything where there are none.
+
     Mitsuba leaves a gap of 1e-4 of a point's coordinates between a surface and the rays that start there; so far from
     the origin or in metres, small parts would lose their shadows.
     """
@@ -219,8 +222,8 @@ class _View:
         middle = [(intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2]
         ray = T_world_cam[:3, :3] @ intrinsics.rays(middle)
         parts = [geom for geom in scene.geoms if geom.instance >= 0] or scene.geoms
-        away = [(geom.T_world_geom[:3, 3] - T_world_cam[:3, 3]) @ T_world_cam[:3, 2] for geom in parts]
-        self._origin = T_world_cam[:3, 3] + ray * (np.median(away) if away else 1.0)
+        self.parts = np.mean([geom.T_world_geom[:3, 3] for geom in parts], axis=0) if parts else np.zeros(3)
+        self._origin = T_world_cam[:3, 3] + ray * ((self.parts - T_world_cam[:3, 3]) @ T_world_cam[:3, 2])
         self._moved = np.concatenate([geom.T_world_geom for geom in scene.geoms]) if scene.geoms else np.zeros((4, 4))
 
     def signature(self, seed: int) -> bytes:
@@ -279,14 +282,19 @@ def check_window(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
 
 
 def _lamp(mi: ModuleType, lamp: DrawnLamp, view: _View) -> dict[str, Any]:
-    """A far lamp, or a ball or point that shines alike in all directions."""
-    rgb = np.array(lamp.rgb)
+    """A ball or point that shines alike in all directions; parallel light comes from a ball that is far away.
+
+    That ball is seen under the same angle as the lamp's bulb from the middle of the parts, so shadows are as soft.
+    """
+    rgb, radius, position = np.array(lamp.rgb), lamp.radius_m, lamp.position
     if lamp.kind == "directional":
-        irradiance = {"type": "rgb", "value": list(np.pi * rgb)}
-        return {"type": "directional", "direction": list(lamp.direction), "irradiance": irradiance}
-    position = [float(x) for x in view.local(lamp.position)]
-    if lamp.radius_m < NO_LAMP_RADIUS_M:
-        return {"type": "point", "position": position, "intensity": {"type": "rgb", "value": list(np.pi * rgb * MM**2)}}
-    radiance = {"type": "rgb", "value": list(rgb / lamp.radius_m**2)}
-    emitter = {"type": "area", "radiance": radiance}
-    return {"type": "sphere", "center": position, "radius": lamp.radius_m * MM, "emitter": emitter}
+        if radius < NO_LAMP_RADIUS_M:
+            irradiance = {"type": "rgb", "value": list(np.pi * rgb)}
+            return {"type": "directional", "direction": list(lamp.direction), "irradiance": irradiance}
+        radius *= PARALLEL_M / np.linalg.norm(position - view.parts)
+        rgb, position = rgb * PARALLEL_M**2, view.parts - PARALLEL_M * lamp.direction
+    centre = [float(x) for x in view.local(position)]
+    if radius < NO_LAMP_RADIUS_M:
+        return {"type": "point", "position": centre, "intensity": {"type": "rgb", "value": list(np.pi * rgb * MM**2)}}
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(rgb / radius**2)}}
+    return {"type": "sphere", "center": centre, "radius": float(radius * MM), "emitter": emitter}
