@@ -1,118 +1,211 @@
-"""Makes labelled data sets: shards by several workers, resumed where a run was interrupted."""
+"""Makes labelled data sets, shard by shard, by any number of workers; takes up what an interrupted run left.
+
+Image ``i`` depends on the config and on ``i`` only, so a data set is the same however its shards were shared out, and
+it can be made longer. One that is to hold so many instances of each part ends with the first shard, in order, that
+fulfils this; shards beyond it, which workers may have begun ahead, are removed.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
-
-from scenes.bop import ChunkWriter, write_camera, write_models
 from scenes.dataset_config import DatasetConfig
+from scenes.dataset_folder import opened, write_manifest
+from scenes.domains import domain_problem
 from scenes.errors import SceneError
-from scenes.image_maker import ImageMaker
+from scenes.shards import SHARD, instances_in, shard_path, shard_problems
+from scenes.workers import Processes, Shard, ThisProcess, Workers
 
-MANIFEST = "dataset.json"
-RASTERISER_THREADS = "LP_NUM_THREADS"
-"""Environment variable of Mesa's software rasteriser; 0 draws in the calling thread."""
+BARREN = 300
+"""A part that none of the first BARREN images for each part of the set shows will not come."""
 
 
-def generate(config: DatasetConfig, out: Path, *, jobs: int = 1, report: Callable[[str], None] = print) -> None:
-    """Write the data set ``config`` describes into ``out``; chunks that are there already are kept.
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """``done`` of ``total`` images are there, ``made`` of them by this run in ``seconds``.
 
-    Raises SceneError when ``out`` holds a data set made with another config or cannot be written.
+    For a data set that is to hold so many instances, ``total`` is an estimate from those counted so far.
     """
-    split = _open_folder(config, out)
-    assert config.count is not None
-    chunks = -(-config.count // config.shard_size)
-    missing = [k for k in range(chunks) if not (split / f"{k:06d}").exists()]
-    sizes = {k: min(config.shard_size, config.count - k * config.shard_size) for k in missing}
-    started, done, total = time.monotonic(), 0, sum(sizes.values())
-    for k in _finished_chunks(config, split, sizes, jobs):
-        done += sizes[k]
-        rate = done / (time.monotonic() - started)
-        report(f"{out.name}: {config.count - total + done} of {config.count} images, {rate:.1f} images/s")
+
+    done: int
+    total: int
+    made: int
+    seconds: float
+
+    @property
+    def rate(self) -> float:
+        """Images a second of this run."""
+        return self.made / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds that the rest takes at this rate, None before the first image."""
+        return (self.total - self.done) / self.rate if self.rate > 0 else None
 
 
-def _open_folder(config: DatasetConfig, out: Path) -> Path:
-    """Create or check the folder; returns the split's folder, free of what an interrupted run left."""
-    parts = config.load_parts()
-    manifest = config.manifest()
-    path = out / MANIFEST
-    try:
-        if path.exists():
-            if path.read_text() != manifest:
-                raise SceneError(f"{out} holds a data set made with other settings ({path}); use another folder")
-        elif out.exists() and any(out.iterdir()):
-            raise SceneError(f"{out} is not empty and holds no {MANIFEST}; use another folder")
-        split = out / config.split
-        split.mkdir(parents=True, exist_ok=True)
-        write_models(out, parts)
-        write_camera(out, config.frame)
-        path.write_text(manifest)
-    except OSError as error:
-        raise SceneError(f"cannot write into {out}: {error}") from error
-    for leftover in split.glob(".*.partial"):
-        shutil.rmtree(leftover)
-    return split
+def generate(
+    config: DatasetConfig,
+    out: Path,
+    *,
+    jobs: int = 1,
+    ray: str = "",
+    verify: bool = False,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> dict[str, Any]:
+    """Make the data set ``config`` describes in ``out``, as far as it is not there yet; returns its manifest.
+
+    ``jobs`` processes share the work, or a Ray cluster at the address ``ray`` (``local``: one with ``jobs`` workers,
+    started for this). ``verify`` first compares all that is there with its sums. ``report`` hears of every few images.
+    Raises SceneError when ``out`` holds other data, is damaged, cannot be written or another run writes into it, when a
+    worker dies, and when a part never shows; what was finished is kept, and the same call goes on from there.
+    """
+    if jobs < 1:
+        raise SceneError(f"jobs {jobs}: must be at least 1")
+    if not ray and (problem := domain_problem(config.domain)):
+        raise SceneError(problem)
+    with opened(config, out) as split:
+        plan = Plan(config, split)
+        if verify:
+            _verify(plan.kept)
+        if not plan.complete:
+            try:
+                _fill(plan, config, split, jobs, ray, report)
+            except (SceneError, OSError) as error:
+                raise SceneError(f"{error}\n{plan.state()} in {out}") from error
+        for shard in plan.surplus():
+            shutil.rmtree(shard)
+        return write_manifest(config, out, plan.counts)
 
 
-def _finished_chunks(config: DatasetConfig, split: Path, sizes: dict[int, int], jobs: int) -> Iterator[int]:
-    tasks = [(k, split / f"{k:06d}", size) for k, size in sizes.items()]
-    if jobs == 1 or len(tasks) <= 1:
-        worker = ChunkMaker(config)
-        try:
-            for task in tasks:
-                yield worker.make(*task)
-        finally:
-            worker.close()
-        return
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(jobs, len(tasks)), initializer=_start_worker, initargs=(config,)) as pool:
-        yield from pool.imap_unordered(_run_task, tasks)
+class Plan:
+    """Which shards are there, which are wanted, and when it is enough."""
 
+    def __init__(self, config: DatasetConfig, split: Path) -> None:
+        self._config, self._split = config, split
+        self._names = {part.obj_id: part.name for part in config.load_parts()}
+        self.counts: dict[int, Counter[int]] = {}
+        self._in_order, self._held = 0, Counter[int]()
+        self._end = None if config.count is None else -(-config.count // config.shard_size)
+        self._asked = 0
+        self.kept = sorted(split.glob(SHARD))
+        for shard in self.kept:
+            self._count(int(shard.name))
 
-_worker: ChunkMaker | None = None
+    @property
+    def complete(self) -> bool:
+        """Whether every shard that is wanted is there."""
+        return self._in_order == self._end
 
-
-def _start_worker(config: DatasetConfig) -> None:
-    """One core a worker: neither OpenCV nor the software rasteriser starts threads of its own."""
-    global _worker
-    os.environ.setdefault(RASTERISER_THREADS, "0")
-    cv2.setNumThreads(1)
-    _worker = ChunkMaker(config)
-
-
-def _run_task(task: tuple[int, Path, int]) -> int:
-    assert _worker is not None
-    return _worker.make(*task)
-
-
-class ChunkMaker:
-    """Makes shards of one data set."""
-
-    def __init__(self, config: DatasetConfig) -> None:
-        self._config = config
-        self._parts = config.load_parts()
-        self._maker = ImageMaker(config)
-
-    def make(self, index: int, folder: Path, count: int) -> int:
-        """Make shard ``index`` of ``count`` images in ``folder``; returns the index."""
-        aside = folder.with_name(f".{folder.name}.partial")
-        shutil.rmtree(aside, ignore_errors=True)
+    @property
+    def total(self) -> int:
+        """Images wanted: exact, or estimated from the instances in the first shards."""
         config = self._config
-        writer = ChunkWriter(aside, index, self._parts, with_depth=config.depth, jpeg=config.jpeg)
-        for k in range(count):
-            made = self._maker.make(index * self._config.shard_size + k)
-            writer.add(made.image, made.intrinsics, made.T_cam_board, made.annotations, made.depth_m)
-        writer.finish()
-        aside.rename(folder)
-        return index
+        if config.count is not None:
+            return config.count
+        assert config.instances is not None
+        images = self._in_order * config.shard_size
+        fewest = min(self._held[obj_id] for obj_id in self._names)
+        if self._end is not None or fewest == 0:
+            return max(images, config.shard_size)
+        return -(-images * config.instances // fewest // config.shard_size) * config.shard_size
 
-    def close(self) -> None:
-        """Free the renderer."""
-        self._maker.close()
+    @property
+    def done(self) -> int:
+        """Images that count towards ``total``."""
+        return min(sum(self._shard(index).count for index in self.counts), self.total)
+
+    def next(self) -> Shard | None:
+        """The next shard to make, None when no more is wanted."""
+        while self._asked in self.counts:
+            self._asked += 1
+        if self._end is not None and self._asked >= self._end:
+            return None
+        self._asked += 1
+        return self._shard(self._asked - 1)
+
+    def finish(self, index: int) -> None:
+        """Take note of a shard that is there now; raises SceneError for parts that never show."""
+        self._count(index)
+
+    def surplus(self) -> list[Path]:
+        """Shards beyond the end of the data set; they are no longer counted."""
+        assert self._end is not None
+        for index in [index for index in self.counts if index >= self._end]:
+            del self.counts[index]
+        return [shard for shard in sorted(self._split.glob(SHARD)) if int(shard.name) >= self._end]
+
+    def state(self) -> str:
+        """What there is, in words."""
+        wanted = "" if self._end is None else f" of {self._end}"
+        return f"{len(self.counts)}{wanted} shards are finished and kept"
+
+    def _shard(self, index: int) -> Shard:
+        first, count = index * self._config.shard_size, self._config.shard_size
+        if self._config.count is not None:
+            count = max(0, min(count, self._config.count - first))
+        return Shard(index=index, first=first, count=count)
+
+    def _count(self, index: int) -> None:
+        """Count a shard, and in order of the shards all that now join on: the end depends on nothing else."""
+        self.counts[index] = instances_in(shard_path(self._split, index))
+        while self._in_order in self.counts and self._in_order != self._end:
+            self._held += self.counts[self._in_order]
+            self._in_order += 1
+            if self._config.instances is not None:
+                if all(self._held[obj_id] >= self._config.instances for obj_id in self._names):
+                    self._end = self._in_order
+                self._refuse_barren()
+
+    def _refuse_barren(self) -> None:
+        images = self._in_order * self._config.shard_size
+        missing = [name for obj_id, name in self._names.items() if not self._held[obj_id]]
+        if missing and images >= BARREN * len(self._names):
+            raise SceneError(
+                f"none of the first {images} images shows {', '.join(missing)}, so there will never be "
+                f"{self._config.instances} instances; use --count, or a size that such a part fits into"
+            )
+
+
+def _fill(
+    plan: Plan, config: DatasetConfig, split: Path, jobs: int, ray: str, report: Callable[[Progress], None]
+) -> None:
+    """Make the shards that are missing."""
+    started, before, under_way = time.monotonic(), plan.done, 0
+
+    def tell() -> None:
+        made = workers.images_made()
+        done = min(before + made, plan.total)
+        report(Progress(done=done, total=plan.total, made=made, seconds=time.monotonic() - started))
+
+    with closing(_workers(config, split, jobs, ray, tell)) as workers:
+        while not plan.complete:
+            while under_way < workers.slots and (shard := plan.next()) is not None:
+                workers.submit(shard)
+                under_way += 1
+            for index in workers.finished():
+                plan.finish(index)
+                under_way -= 1
+            tell()
+
+
+def _workers(config: DatasetConfig, split: Path, jobs: int, ray: str, tick: Callable[[], None]) -> Workers:
+    if ray:
+        from scenes.cluster import RayWorkers
+
+        return RayWorkers(config, split, ray, jobs)
+    if jobs == 1:
+        return ThisProcess(config, split, tick)
+    return Processes(config, split, jobs)
+
+
+def _verify(shards: Iterable[Path]) -> None:
+    problems = [problem for shard in shards for problem in shard_problems(shard)]
+    if problems:
+        raise SceneError("\n".join(problems))

@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
@@ -20,6 +20,7 @@ from perception.estimates import PerceptionError
 from scenes.errors import SceneError
 from twin.part_cli import Part
 from twin.pick_config import PickConfig
+from twin.render_cli import Data, Render
 from twin.robot import TwinError
 
 
@@ -44,36 +45,6 @@ class Pick(PickConfig):
             print(json.dumps(card, indent=1))
         else:
             print_scorecard(card, self.out)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Render:
-    """Render a labelled data set in BOP layout: crops of single parts, or windows of whole scenes."""
-
-    kind: Literal["crop", "window", "scene"] = "crop"
-    """Crops round one part each, windows with any number of parts, or whole frames."""
-    split: Literal["train", "val"] = "train"
-    """Which board textures, lights and camera heights to draw from."""
-    count: int = 1000
-    """Number of images."""
-    seed: int = 0
-    """Seed of everything that is drawn."""
-    jobs: int = os.cpu_count() or 1
-    """Worker processes."""
-    out: Path = Path("data/crops")
-    """Folder of the data set; a run that was stopped is taken up where it was."""
-    json: bool = False
-    """Print where the data set is and its configuration as JSON."""
-
-    def run(self) -> None:
-        """Generate what is missing of the data set."""
-        from scenes.dataset_config import DatasetConfig
-        from scenes.generate import generate
-
-        config = DatasetConfig(kind=self.kind, split=self.split, count=self.count, seed=self.seed)
-        generate(config, self.out, jobs=self.jobs, report=lambda line: print(line, file=sys.stderr, flush=True))
-        if self.json:
-            print(json.dumps({"out": str(self.out)} | dataclasses.asdict(config), default=str, indent=1))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -144,6 +115,7 @@ class Doctor:
 Verb = (
     Annotated[Pick, subcommand("pick")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[Data, subcommand("data")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Part, subcommand("part")]
     | Annotated[View, subcommand("view")]

@@ -1,0 +1,227 @@
+"""``tagcell render`` makes data sets; ``tagcell data`` checks one, shows what they vary in, and lists recipes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, UseAppendAction, arg, subcommand
+
+from scenes.errors import SceneError
+
+if TYPE_CHECKING:
+    from scenes.dataset_config import DatasetConfig
+
+Kind = Literal["crop", "window", "scene"]
+Domain = Literal["classic", "filament", "mitsuba"]
+Split = Literal["train", "val", "test"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render:
+    """Render a labelled data set in BOP layout, with COCO files.
+
+    What was finished is kept: stop it, run the same command again, and it goes on. The images depend on the settings
+    only, not on --jobs or --ray. `tagcell data recipes` lists settings by name.
+    """
+
+    recipe: str | None = None
+    """Settings by name; see `tagcell data recipes`."""
+    kind: Kind | None = None
+    """crop (the default): a window of the camera's frame round one part; window: one with any number of parts;
+    scene: a whole frame."""
+    part: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """A part to show; give it once for each. Default: the built-in ones."""
+    domain: Domain | None = None
+    """What draws the images. Default: classic."""
+    split: Split | None = None
+    """Which lights, backgrounds and camera heights to draw from. Default: train."""
+    count: int | None = None
+    """Number of images. Default: 1000. A data set can be made longer later."""
+    instances: int | None = None
+    """Instead of --count: go on until each part has been seen this often, a tenth of it at least."""
+    seed: int | None = None
+    """Seed of everything that is drawn. Default: 0."""
+    size: Annotated[str | None, arg(metavar="WxH")] = None
+    """Width and height of an image in pixels, like 256x256."""
+    downscale: int | None = None
+    """How many of the camera's pixels make one of a crop (default 1) or window (4), in each direction."""
+    faces: Literal["physics", "uniform"] | None = None
+    """Parts rest on their faces as often as physics leaves them there (the default), or equally often on each."""
+    jpeg: int | None = None
+    """Write colours as JPEG of this quality, 1 to 100. Default: PNG."""
+    no_depth: FlagCreatePairsOff[bool] = False
+    """Leave the depth images out."""
+    shard: int | None = None
+    """Images a folder. Default: about ten seconds of work."""
+    parts_dir: Path | None = None
+    """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
+    jobs: int = os.cpu_count() or 1
+    """Worker processes, of one core each."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS|local")] = None
+    """Share the work out over the Ray cluster at this address, or over one that is started here with --jobs workers.
+    --out must be a folder that all its machines share."""
+    verify: FlagCreatePairsOff[bool] = False
+    """First compare everything that is there with its checksums."""
+    out: Path | None = None
+    """Folder of the data set. Default: data/RECIPE or data/KINDs."""
+    json: FlagCreatePairsOff[bool] = False
+    """Print where the data set is and what it holds as JSON."""
+
+    def run(self) -> None:
+        """Generate what is missing of the data set."""
+        from scenes.generate import generate
+        from twin.render_progress import image_progress
+
+        config = self.config()
+        out = self.out or Path("data") / (self.recipe or f"{config.kind}s")
+        usual = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the workers, too
+        try:
+            with image_progress(out.name) as report:
+                made = generate(config, out, jobs=self.jobs, ray=self.ray or "", verify=self.verify, report=report)
+        finally:
+            signal.signal(signal.SIGTERM, usual)
+        if self.json:
+            print(json.dumps({"out": str(out)} | made, indent=1))
+        else:
+            seen = ", ".join(f"{name} {number}" for name, number in made["instances"].items())
+            print(f"{out}: {made['images']} images in {len(made['shards'])} shards; instances seen: {seen}")
+
+    def config(self) -> DatasetConfig:
+        """The config of the data set; raises SceneError for settings that make none or contradict the recipe."""
+        from scenes.dataset_config import DatasetConfig
+        from scenes.recipes import load_recipe
+
+        given = self._given()
+        if self.recipe is None:
+            settings: dict[str, Any] = given if self.instances is None else {"count": None} | given
+            return DatasetConfig(**settings)
+        config = load_recipe(self.recipe)
+        for name, value in given.items():
+            has = getattr(config, name)
+            if name != "parts_dir" and value != has:
+                raise SceneError(
+                    f"{_option(name)} contradicts recipe {self.recipe!r}, whose {name} is {has}; leave one of them out"
+                )
+        return dataclasses.replace(config, parts_dir=self.parts_dir)
+
+    def _given(self) -> dict[str, Any]:
+        """The fields of DatasetConfig that were given."""
+        names = ("kind", "domain", "split", "count", "instances", "seed", "downscale", "faces", "jpeg", "shard")
+        given = {name: getattr(self, name) for name in (*names, "parts_dir")}
+        given |= {"parts": self.part or None, "size": self.size and _size(self.size)}
+        given |= {"depth": False if self.no_depth else None}
+        if self.count is not None and self.instances is not None:
+            raise SceneError(f"--count {self.count} and --instances {self.instances}: give one of them")
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DataValidate:
+    """Check a data set: BOP and COCO layout, labels against images, checksums."""
+
+    folder: Positional[Path]
+    """Folder of the data set."""
+    json: FlagCreatePairsOff[bool] = False
+    """Print as JSON."""
+
+    def run(self) -> None:
+        """Print what is wrong, a line each; exit code 1 when anything is."""
+        from scenes.validate import validate
+
+        problems = validate(self.folder)
+        if self.json:
+            print(json.dumps({"folder": str(self.folder), "problems": problems}, indent=1))
+        else:
+            print("\n".join(problems) or f"{self.folder}: nothing is wrong")
+        if problems:
+            sys.exit(1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DataSheet:
+    """Write a contact sheet: what the ranges that images are drawn from look like."""
+
+    domain: Domain = "classic"
+    """What draws the images."""
+    kind: Kind = "crop"
+    """Crops, windows or whole frames."""
+    split: Split = "train"
+    """Which lights, backgrounds and camera heights to draw from."""
+    part: Annotated[tuple[str, ...], UseAppendAction] = ()
+    """A part to show; give it once for each. Default: the built-in ones."""
+    parts_dir: Path | None = None
+    """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
+    seed: int = 0
+    """Seed of everything that is drawn."""
+    out: Path = Path("runs/sheet.png")
+    """The picture to write."""
+
+    def run(self) -> None:
+        """Draw and save."""
+        from scenes.contact_sheet import write_contact_sheet
+        from scenes.dataset_config import DatasetConfig
+        from twin.part_cli import progress_bar
+
+        config = DatasetConfig(
+            domain=self.domain,
+            kind=self.kind,
+            split=self.split,
+            parts=self.part,
+            parts_dir=self.parts_dir,
+            seed=self.seed,
+        )
+        with progress_bar(f"{self.domain} {self.kind}s") as advance:
+            write_contact_sheet(config, self.out, progress=advance)
+        print(self.out)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DataRecipes:
+    """List the data sets that are known by name: `tagcell render --recipe NAME`."""
+
+    json: FlagCreatePairsOff[bool] = False
+    """Print them with all that they set as JSON."""
+
+    def run(self) -> None:
+        """Print one line a recipe."""
+        from scenes.recipes import recipe, recipe_names
+
+        recipes = {name: recipe(name) for name in recipe_names()}
+        if self.json:
+            print(json.dumps(recipes, indent=1))
+            return
+        for name, content in recipes.items():
+            print(f"{name:22s} {content['about']}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Data:
+    """Data sets: check one, show what they vary in, list recipes."""
+
+    action: OmitSubcommandPrefixes[
+        Annotated[DataValidate, subcommand("validate", prefix_name=False)]
+        | Annotated[DataSheet, subcommand("sheet", prefix_name=False)]
+        | Annotated[DataRecipes, subcommand("recipes", prefix_name=False)]
+    ]
+
+    def run(self) -> None:
+        """Run the chosen action."""
+        self.action.run()
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found:
+        raise SceneError(f"--size {text!r}: give width and height in pixels, like 256x256")
+    return int(found[1]), int(found[2])
+
+
+def _option(name: str) -> str:
+    return {"parts": "--part", "depth": "--no-depth"}.get(name, f"--{name}")
