@@ -23,9 +23,8 @@ def test_the_faces_of_a_cube_map_cover_every_direction_once():
     np.testing.assert_allclose((solid_angle[..., None] * d).sum(axis=(0, 1, 2)), 0, atol=1e-9)
     for forward, column, row in np.array(FACES):
         assert forward @ column == forward @ row == column @ row == 0
-        assert (
-            np.linalg.det([forward, column, row]) == 1
-        )  # rows, columns and forward: all faces are seen from the same side
+        # seen from within, columns count up to the left and rows down, on every face
+        assert np.linalg.det([forward, column, row]) == pytest.approx(-1)
 
 
 def test_neighbouring_faces_meet():
