@@ -42,7 +42,7 @@ def test_every_range_has_limits_that_hold_its_default_and_refuse_what_is_beyond(
     for field in dataclasses.fields(kind):
         limits = hints[field.name].__metadata__[0]
         value = getattr(kind(), field.name)
-        beyond = limits.high + 1
+        beyond, message = limits.high + 1, re.escape(f"{limits.low:g} to {limits.high:g}")
         wrong = (value[0], beyond) if isinstance(value, tuple) else beyond
         with pytest.raises(SceneError, match=f"range {field.name} = .*{message}"):
             kind(**{field.name: wrong})
