@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from cad.parts import BUILT_IN, Part, load_part
 from cad.spatial import BASLER, Intrinsics
@@ -80,9 +79,10 @@ class DatasetConfig:
         if self.kind == "scene" and self.downscale is not None:
             raise SceneError(f"downscale {self.downscale}: a scene is scaled to its size; leave downscale out")
         width, height = self.pixels
-        most = (BASLER.width // self.scale_down, BASLER.height // self.scale_down)
+        smaller = 1 if self.kind == "scene" else int(self.scale_down)
+        most = (BASLER.width // smaller, BASLER.height // smaller)
         if not (32 <= width <= most[0] and 32 <= height <= most[1]):
-            raise SceneError(f"size {width} x {height}: must be from 32 x 32 to {most[0]:.0f} x {most[1]:.0f} pixels")
+            raise SceneError(f"size {width} x {height}: must be from 32 x 32 to {most[0]} x {most[1]} pixels")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -142,16 +142,6 @@ class DatasetConfig:
     def load_parts(self) -> list[Part]:
         """The parts shown, in order."""
         return [load_part(name, self.parts_dir) for name in self.names]
-
-    def manifest(self) -> str:
-        """The config as JSON, with the hashes of the parts' meshes: the data set's identity."""
-        content: dict[str, Any] = asdict(self)
-        content |= {"look": asdict(self.look_ranges), "shots": asdict(self.shot_ranges)}
-        content |= {"view": asdict(self.view_ranges)}
-        content |= {"size": self.pixels, "downscale": self.scale_down, "shard": self.shard_size}
-        content["parts"] = {part.name: part.mesh_hash for part in self.load_parts()}
-        del content["parts_dir"]
-        return json.dumps(content, indent=1)
 
 
 def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:

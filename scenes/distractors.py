@@ -219,7 +219,7 @@ def _wire(points: tuple[tuple[float, float], ...], radius: float) -> _Thing:
     at = np.column_stack([np.array(points, float), np.zeros(len(points))])
     straight = [cylinder(radius=radius, segment=at[k : k + 2], sections=12) for k in range(len(at) - 1)]
     bends = [icosphere(subdivisions=1, radius=radius).apply_translation(p) for p in at[1:-1]]
-    return _Thing([*straight, *bends], straight)
+    return _Thing([*straight, *bends])
 
 
 def _coin(diameter: float, height: float) -> _Thing:

@@ -148,7 +148,7 @@ def test_a_damaged_file_is_made_again(parts, tmp_path, damage):
 
 def test_a_pool_that_cannot_be_stored_is_an_error(parts, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(SceneError, match="cannot write rests.npz"):
+    with pytest.raises(SceneError, match=r"cannot write rests\.npz"):
         RestPool.load_or_make(parts[:1], tmp_path / "file", QUICK)
 
 
