@@ -1,6 +1,7 @@
 """How a scene is lit and what it is made of: ranges, draws from them, textures, wear, and a stage dressed in them."""
 
 import dataclasses
+import re
 import typing
 
 import numpy as np
