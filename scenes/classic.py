@@ -39,6 +39,7 @@ class ClassicRenderer:
         self._option.sitegroup[:] = False
         self._instance_of_geom = instance_of_geom(model)
         self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False  # by then the display may be gone, and the process gives back everything
 
     def render(
         self,
