@@ -2,8 +2,8 @@
 
 World = ``board``. BOP stores millimetres; ``cam_R_m2c`` and ``cam_t_m2c`` are ``T_cam_part``. Boxes are as BOP's
 toolkit computes them: width and height are the differences between the last and the first column and row. Two keys are
-our own: ``stable_pose`` in ``scene_gt.json``, the index of the face that the part rests on, and ``cam_dist`` in
-``scene_camera.json``, OpenCV's distortion coefficients, written only where the lens distorts.
+our own in ``scene_camera.json``, written only where they say something: ``cam_dist``, OpenCV's distortion coefficients,
+and ``gamma``, the camera's; one in ``scene_gt.json``: ``stable_pose``, the index of the face that the part rests on.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cad.equivalence import symmetries_to_json
 from cad.parts import Part
@@ -29,7 +29,7 @@ DEPTH_SCALE = 0.02
 """Millimetres a unit of the 16-bit depth images: steps of 20 um up to 1.3 m."""
 MASKS = ("mask", "mask_visib")
 NO_BOX = (-1, -1, -1, -1)
-PART_SIZE_M = (1e-4, 1.0)
+PART_SIZE_M = (5e-4, 1.0)
 """What a part's diameter can be: anything else was read in the wrong unit."""
 
 Box = tuple[int, int, int, int]
@@ -97,11 +97,12 @@ class ChunkWriter:
         T_cam_board: Array,
         annotations: Sequence[Annotation],
         depth_m: NDArray[np.float32] | None = None,
-        distortion: Array | None = None,
+        distortion: ArrayLike = (),
+        gamma: float = 1.0,
     ) -> None:
         """Append an image (H, W, 3) with its camera and its parts in order.
 
-        ``distortion`` are OpenCV's coefficients k1, k2, p1, p2, k3.
+        ``distortion`` are OpenCV's coefficients k1, k2, p1, p2; grey levels go with the light to the power ``gamma``.
         """
         image = len(self._cameras)
         shape = rgb.shape[:2]
@@ -132,7 +133,7 @@ class ChunkWriter:
                     visib_fract=info["visib_fract"],
                     keypoints=annotation.keypoints,
                 )
-        self._cameras[str(image)] = _camera(intrinsics, T_cam_board, distortion)
+        self._cameras[str(image)] = _camera(intrinsics, T_cam_board, distortion, gamma)
         self._truths[str(image)] = [_truth(a) for a in annotations]
         self._infos[str(image)] = infos
 
@@ -216,15 +217,17 @@ def T_from_bop(R: Sequence[float], t_mm: Sequence[float]) -> Array:
     return T
 
 
-def _camera(intrinsics: Intrinsics, T_cam_board: Array, distortion: Array | None) -> dict[str, Any]:
+def _camera(intrinsics: Intrinsics, T_cam_board: Array, distortion: ArrayLike, gamma: float) -> dict[str, Any]:
     camera = {
         "cam_K": intrinsics.matrix.ravel().tolist(),
         "depth_scale": DEPTH_SCALE,
         "cam_R_w2c": T_cam_board[:3, :3].ravel().tolist(),
         "cam_t_w2c": (T_cam_board[:3, 3] * 1e3).tolist(),
     }
-    if distortion is not None and np.any(distortion):
+    if np.any(distortion):
         camera["cam_dist"] = np.asarray(distortion, np.float64).ravel().tolist()
+    if gamma != 1.0:
+        camera["gamma"] = gamma
     return camera
 
 
