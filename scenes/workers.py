@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
-import numpy as np
 
 from scenes.bop import ChunkWriter
 from scenes.dataset_config import DatasetConfig
@@ -95,9 +94,14 @@ class ShardMaker:
                 )
                 for index in range(shard.first, shard.first + shard.count):
                     made = self._maker.make(index)
-                    distortion = np.array(made.lens.coefficients)
                     writer.add(
-                        made.image, made.intrinsics, made.T_cam_board, made.annotations, made.depth_m, distortion
+                        made.image,
+                        made.intrinsics,
+                        made.T_cam_board,
+                        made.annotations,
+                        made.depth_m,
+                        distortion=made.lens.coefficients,
+                        gamma=made.gamma,
                     )
                     tick()
                 writer.finish()
