@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import Part
-from cad.spatial import BASLER, Array, Intrinsics, quat_wxyz_from_rotation
+from cad.spatial import BASLER, Array, Intrinsics
 from cad.tagboard import TagboardConfig
 from scenes.camera import add_camera, set_camera_pose
 from scenes.distorted import DistortedRenderer
 from scenes.distractors import distractor_meshes
 from scenes.domains import Domain, make_renderer
+from scenes.environments import irradiance
 from scenes.gl import mujoco
 from scenes.lens import Lens
 from scenes.look import (
@@ -32,10 +33,13 @@ from scenes.look import (
 from scenes.randomize import LIGHTS, Look, draw_distractor_surface, draw_part_surface
 from scenes.ranges import LookRanges
 from scenes.render import HIDDEN_GROUP, Rendering, What
+from scenes.scene_export import WHITE_LUX
 from scenes.shots import Placed, Shot
 from scenes.textures import worn
 
 LIGHT_DISTANCE_M = 0.5
+CONE = 1.6
+"""The cone of a lamp covers a disc of this many times the half side of the shadows' square, square to its axis."""
 BOARD_ASPECT = 0.6875
 """Height of the board over its width."""
 
@@ -71,12 +75,14 @@ class Stage:
         self._parts = {part.name: part for part in parts}
         self._slots = config.slots
         spec = _build(parts, textures, wear, config, board or TagboardConfig())
-        _add_lamps(spec)
-        if domain != "classic":
+        self._photometric = domain != "classic"
+        _add_lamps(spec, self._photometric)
+        if self._photometric:
             _add_environments(spec, environments)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._find(len(textures), len(wear))
+        self._environments = [irradiance(cube) for cube in environments] if self._photometric else []
         self._first_slot = {part.name: k * config.slots for k, part in enumerate(parts)}
         self._shown: list[int] = []
         width, height = config.max_size
@@ -173,7 +179,7 @@ class Stage:
         model = self.model
         mocap = model.body(body).mocapid[0]
         self.data.mocap_pos[mocap] = placed.T_board_object[:3, 3]
-        self.data.mocap_quat[mocap] = quat_wxyz_from_rotation(placed.T_board_object[:3, :3])
+        mujoco.mju_mat2Quat(self.data.mocap_quat[mocap], placed.T_board_object[:3, :3].ravel())
         geom = model.geom(f"{body}_visual").id
         model.geom_group[geom] = 1
         self._shown.append(geom)
@@ -189,9 +195,18 @@ class Stage:
                 continue
             lamp = look.lamps[i]
             towards = np.array(lamp.towards) / np.linalg.norm(lamp.towards)
+            distance = lamp.distance_m if self._photometric else LIGHT_DISTANCE_M
             model.light_diffuse[i], model.light_specular[i] = lamp.rgb, lamp.specular
             model.light_castshadow[i] = lamp.shadow
-            data.light_xpos[i], data.light_xdir[i] = target + LIGHT_DISTANCE_M * towards, -towards
+            data.light_xpos[i], data.light_xdir[i] = target + distance * towards, -towards
+            if self._photometric:
+                model.light_intensity[i] = WHITE_LUX * distance**2
+                model.light_bulbradius[i] = lamp.radius_m
+                model.light_cutoff[i] = np.degrees(np.arctan(CONE * model.vis.map.shadowclip / distance))
+        for k, board_irradiance in enumerate(self._environments):
+            i = LIGHTS + k
+            model.light_active[i] = k == look.environment
+            model.light_intensity[i] = look.ambient / board_irradiance * WHITE_LUX / np.pi
 
 
 def _build(
@@ -230,21 +245,23 @@ def _build(
     return spec
 
 
-def _add_lamps(spec: mujoco.MjSpec) -> None:
+def _add_lamps(spec: mujoco.MjSpec, photometric: bool) -> None:
+    """Lamps that shine from a place, into a cone, where light is physical; from a direction in the classic renderer."""
+    kind = mujoco.mjtLightType.mjLIGHT_SPOT if photometric else mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     for i in range(LIGHTS):
-        light = spec.worldbody.add_light(name=f"lamp_{i}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        light = spec.worldbody.add_light(name=f"lamp_{i}", type=kind)
         light.ambient, light.dir = [0.0] * 3, [0.0, 0.0, -1.0]
 
 
 def _add_environments(spec: mujoco.MjSpec, environments: Sequence[NDArray[np.uint8]]) -> None:
-    """An image light for each cube map (6, N, N, 3): what metal reflects; one of them is on at a time."""
+    """An image light for each cube map (6, N, N, 3): what metal reflects; at most one of them is on."""
     for k, faces in enumerate(environments):
         name = f"environment_{k:02d}"
         texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_CUBE)
         texture.height, texture.width, texture.nchannel = 6 * faces.shape[1], faces.shape[2], 3
         texture.data = np.ascontiguousarray(faces).tobytes()
         light = spec.worldbody.add_light(name=name, type=mujoco.mjtLightType.mjLIGHT_IMAGE, texture=name)
-        light.intensity, light.active = 8000.0, k == 0
+        light.active = False
 
 
 def _add_matt(spec: mujoco.MjSpec, name: str, image: NDArray[np.uint8]) -> None:
