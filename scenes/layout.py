@@ -72,7 +72,7 @@ class Shelf:
         self.rests, self.parts = rests, rests.parts
         self.distractors = {
             name: distractor
-            for name, distractor in distractors.items()
+            for name, distractor in sorted(distractors.items())
             if not any(distractor.resembles(part) for part in rests.parts)
         }
         self.kinds: dict[str, list[Distractor]] = {}

@@ -72,6 +72,21 @@ def test_the_share_of_drops_that_are_over_grows_to_all(brick):
     assert told == sorted(told) and told[0] < 1.0 and told[-1] == 1.0
 
 
+def test_drops_begin_in_the_orientations_they_are_given(brick):
+    tilt = np.radians(2.0)
+    R = np.array([[1.0, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    on_end = R @ np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    drops = drop_part(
+        part_of(brick), [brick], replace(QUICK, drops=4, height_m=3e-4), R_start=np.array([on_end, R] * 2)
+    )
+    assert np.abs(drops.R_table_part[:, 2]).argmax(axis=1).tolist() == [0, 2, 0, 2]
+
+
+def test_as_many_orientations_as_drops_are_needed(brick):
+    with pytest.raises(SceneError, match="60 drops need"):
+        drop_part(part_of(brick), [brick], QUICK, R_start=np.eye(3)[None])
+
+
 def test_drops_that_have_no_time_to_settle_are_not_still(brick):
     drops = drop_part(part_of(brick), [brick], replace(QUICK, duration_s=0.05))
     assert not drops.still.any()
