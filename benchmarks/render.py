@@ -1,0 +1,202 @@
+"""How fast labelled images are made, and what data sets cost: python -m benchmarks.render [--blender PYTHON].
+
+Every case makes images as ``tagcell render`` does, all the way to files on disk: colours, masks, visible masks, depth,
+keypoints, COCO and BOP labels, checksums. Rates are those of so many workers together once each has made its first
+image; what starting costs is measured apart, and both count in what is projected for whole data sets. Beside it one
+scene is drawn in every domain, and by Blender's Cycles under an interpreter that has bpy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import tyro
+
+from benchmarks.render_domains import Drawn, compare, overlap, strip
+from benchmarks.render_rates import Rate, measure_rate, stages
+from benchmarks.tables import Section, show
+from scenes.dataset_config import DatasetConfig, Kind
+from scenes.domains import Domain, domain_problem
+from scenes.ranges import LookRanges
+
+Name = Literal[
+    "crop-shadow",
+    "crop-plain",
+    "crop",
+    "crop-filament",
+    "crop-mitsuba",
+    "frame",
+    "frame-filament",
+    "frame-mitsuba",
+    "full",
+    "compare",
+]
+ONE_SHADOW = LookRanges(default_look=0.0, lamps=(1, 3), shadow_share=1.0)
+NO_SHADOW = LookRanges(default_look=0.0, shadow_share=0.0)
+PAPER_FRAMES, PAPER_CROPS, PAPER_HOURS = 10_000, 60_000, (14.0, 17.0)
+"""The published data set: frames of 2208 x 1242, crops of 256 x 256, and the hours they took on two graphics cards."""
+MILLIONS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One row: what is made, and the images/s that are asked for (None: only reported)."""
+
+    what: str
+    config: DatasetConfig
+    target: float | None = None
+
+
+def _config(kind: Kind, domain: Domain, shard: int, **settings: object) -> DatasetConfig:
+    return replace(DatasetConfig(kind=kind, domain=domain, shard=shard, count=10_000_000, seed=1), **settings)
+
+
+CASES: dict[Name, Case] = {
+    "crop-shadow": Case(
+        what="classic, one lamp casts shadows", config=_config("crop", "classic", 50, look=ONE_SHADOW), target=60
+    ),
+    "crop-plain": Case(what="classic, no shadows", config=_config("crop", "classic", 50, look=NO_SHADOW), target=150),
+    "crop": Case(what="classic, as generated", config=_config("crop", "classic", 50)),
+    "crop-filament": Case(what="filament", config=_config("crop", "filament", 25), target=25),
+    "crop-mitsuba": Case(what="mitsuba", config=_config("crop", "mitsuba", 1)),
+    "frame": Case(what="classic", config=_config("scene", "classic", 2), target=2),
+    "frame-filament": Case(what="filament", config=_config("scene", "filament", 1)),
+    "frame-mitsuba": Case(what="mitsuba", config=_config("scene", "mitsuba", 1)),
+    "full": Case(what="classic", config=_config("scene", "classic", 1, size=(5472, 3648))),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderBenchmark:
+    """Options of the benchmark."""
+
+    only: tuple[Name, ...] = (*CASES, "compare")
+    """Rows to measure."""
+    seconds: float = 20.0
+    """Time for each row; at least two shards a worker are made."""
+    workers: int = 2
+    """Processes that make images at the same time."""
+    images: int = 20
+    """Pictures of the scene that all domains share."""
+    blender: Path | None = None
+    """A Python interpreter that has bpy, to draw that scene with Cycles too."""
+    strip: Path | None = None
+    """File for that scene's pictures side by side."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def __post_init__(self) -> None:
+        if self.seconds <= 0 or self.workers < 1 or self.images < 1:
+            raise ValueError(
+                f"seconds {self.seconds} must be positive, workers {self.workers} and images {self.images} at least 1"
+            )
+
+
+def rates_section(rates: dict[Name, Rate]) -> Section:
+    """Images/s beside what is asked for."""
+    rows = [
+        (
+            f"{case.config.pixels[0]} x {case.config.pixels[1]}",
+            case.what,
+            f"{rate.rate:.3g}",
+            "" if case.target is None else f">= {case.target:g}",
+            f"{rate.cpu_ms:.4g}",
+            f"{rate.start_s:.1f}",
+            f"{rate.memory_mb:.0f}",
+            f"{rate.kilobytes:.0f}",
+            f"{rate.images}",
+        )
+        for case, rate in ((CASES[name], rate) for name, rate in rates.items())
+    ]
+    columns = ("size", "domain", "images/s", "target", "CPU ms", "start s", "MB a worker", "kB an image", "images")
+    workers = next(iter(rates.values())).workers
+    return Section(title=f"Labelled images to disk, {workers} workers", columns=columns, rows=rows)
+
+
+def stages_section(found: dict[Name, dict[str, float]]) -> Section:
+    """CPU time by stage."""
+    names = next(iter(found.values())).keys()
+    rows = [(stage, *(f"{found[case][stage]:.2f}" for case in found)) for stage in names]
+    rows.append(("all", *(f"{sum(stages.values()):.1f}" for stages in found.values())))
+    return Section(title="CPU ms of one labelled image, one worker alone", columns=("stage", *found), rows=rows)
+
+
+def projection_section(rates: dict[Name, Rate]) -> Section:
+    """Hours for whole data sets at the measured rates, starting included."""
+    hours: Callable[[Name, int], float] = lambda name, count: (count / rates[name].rate + rates[name].start_s) / 3600  # noqa: E731
+    plans: list[tuple[str, list[tuple[Name, int]]]] = []
+    for label, crop, frame in (("classic", "crop", "frame"), ("filament", "crop-filament", "frame-filament")):
+        plans.append(
+            (f"{PAPER_FRAMES:,} frames + {PAPER_CROPS:,} crops, {label}", [(frame, PAPER_FRAMES), (crop, PAPER_CROPS)])
+        )
+    plans.insert(
+        1,
+        (
+            f"{PAPER_FRAMES:,} classic frames + {PAPER_CROPS:,} filament crops",
+            [("frame", PAPER_FRAMES), ("crop-filament", PAPER_CROPS)],
+        ),
+    )
+    million = MILLIONS * 1_000_000
+    plans += [
+        (f"{MILLIONS} million crops, {CASES[name].what}", [(name, million)])
+        for name in ("crop", "crop-filament", "crop-mitsuba")
+    ]
+    rows = []
+    for label, counts in plans:
+        if all(name in rates for name, _ in counts):
+            took = [hours(name, count) for name, count in counts]
+            size = sum(count * rates[name].kilobytes for name, count in counts) / 1e6
+            cores = sum(h * rates[name].workers for h, (name, _) in zip(took, counts, strict=True))
+            rows.append(
+                (label, " + ".join(f"{h:.2f}" for h in took), f"{sum(took):.2f}", f"{cores:.0f}", f"{size:.0f}")
+            )
+    return Section(title="Data sets", columns=("data set", "hours", "in all", "core hours", "GB"), rows=rows)
+
+
+def compare_section(drawn: list[Drawn]) -> Section:
+    """One scene by every renderer."""
+    rows = [
+        (
+            one.name,
+            f"{one.cpu_ms:.4g}",
+            f"{one.rate:.3g}",
+            f"{one.cpu_ms / drawn[0].cpu_ms:.1f}",
+            f"{one.first_s:.1f}",
+            f"{overlap(one.mask, drawn[0].mask):.4f}",
+        )
+        for one in drawn
+    ]
+    columns = ("renderer", "CPU ms", "images/s on two cores", "times classic", "first s", "mask IoU with classic")
+    return Section(title="One scene of 256 x 256, drawn only", columns=columns, rows=rows)
+
+
+def main(options: RenderBenchmark) -> None:
+    """Measure and print."""
+    chosen = [name for name in CASES if name in options.only and not domain_problem(CASES[name].config.domain)]
+    rates = {name: measure_rate(CASES[name].config, options.workers, options.seconds) for name in chosen}
+    found = {name: stages(CASES[name].config, _few(rates[name], options.seconds)) for name in chosen}
+    sections = [rates_section(rates), stages_section(found), projection_section(rates)] if rates else []
+    if "compare" in options.only:
+        drawn = compare(options.images, options.blender)
+        sections.append(compare_section(drawn))
+        if options.strip is not None:
+            cv2.imwrite(str(options.strip), cv2.cvtColor(strip(drawn, 1), cv2.COLOR_RGB2BGR))
+    note = f"{options.workers} workers, {options.seconds:g} s a row; load {os.getloadavg()[0]:.1f}"
+    missing = sorted({CASES[n].config.domain for n in CASES if n in options.only and n not in chosen})
+    show(
+        sections, note + "".join(f"; no {domain}: {domain_problem(domain)}" for domain in missing), as_json=options.json
+    )
+
+
+def _few(rate: Rate, seconds: float) -> int:
+    """Images that a single worker makes in about a third of the time."""
+    return max(1, min(200, round(rate.rate / rate.workers * seconds / 3)))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(RenderBenchmark))
