@@ -90,16 +90,14 @@ TRAIN_SHOTS = ShotRanges()
 TEST_SHOTS = ShotRanges(
     area_half_m=(0.115, 0.070),
     gap_m=(0.0015, 0.008),
-    touching=0.25,
-    close=0.25,
+    touching=0.2,
+    close=0.2,
     dust_lean_deg=(0.0, 0.0),
     neighbours=(0.25, 0.3, 0.25, 0.2),
     crop_distractors=(0.4, 0.3, 0.18, 0.12),
     scene_distractors=(2, 10),
 )
-"""More crowded than training's: parts lie farther out, closer together and twice as often touching, without dust below
-them.
-"""
+"""More crowded than training's: parts lie farther out, closer together and more often touching, without dust below."""
 SHOTS: dict[Split, ShotRanges] = {"train": TRAIN_SHOTS, "val": TRAIN_SHOTS, "test": TEST_SHOTS}
 
 
