@@ -1,33 +1,22 @@
 from collections import Counter
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from drawn_shots import SCENE, footprint, frames, shots
 from scipy.stats import binom
 
-from cad.collision import contact_pieces
-from cad.parts import load_part, part_names, planar
+from cad.parts import load_part, part_names
 from cad.resting import nearest_rest
 from cad.spatial import BASLER, Intrinsics, apply, inverse, transform
 from scenes.cell_config import CellConfig
 from scenes.dataset_config import DatasetConfig
-from scenes.distractors import CRUMB, distractor_meshes, distractors
 from scenes.errors import SceneError
-from scenes.gl import mujoco
-from scenes.layout import Shelf
 from scenes.ranges import TEST_VIEW, TRAIN_VIEW
 from scenes.rests import RestPool
 from scenes.shots import SHOTS, TEST_SHOTS, TRAIN_SHOTS, ShotRanges, ShotSampler, board_point
-from scenes.touching import TOUCH_M, Slider
-from scenes.workcell import build_board_scene, part_body, set_parts
 
 CELL = CellConfig()
-TOUCHING = replace(
-    TEST_SHOTS, touching=1.0, close=0.0, neighbours=(0.0, 1.0), crop_distractors=(1.0,), crop_crumbs=(0, 0)
-)
-SCENE = DatasetConfig(kind="scene")
 
 
 @pytest.fixture(scope="module")
@@ -43,45 +32,6 @@ def pool(parts):
 @pytest.fixture(scope="module")
 def sampler(pool):
     return ShotSampler(pool)
-
-
-@pytest.fixture(scope="module")
-def slider(parts):
-    return Slider(
-        {name: contact_pieces(part, "grasp") for name, part in parts.items()}
-        | {name: thing.pieces for name, thing in distractors().items()}
-    )
-
-
-def shots(draw, count, seed=0):
-    rng = np.random.default_rng(seed)
-    return [draw(rng) for _ in range(count)]
-
-
-def frames(sampler, count, seed=0, config=SCENE):
-    return shots(lambda rng: sampler.frame(rng, config.frame, config.scale_down), count, seed)
-
-
-def footprint(placed, parts):
-    """Centre (2,) of a thing's bounding rectangle seen from above, and radius of the circle round it."""
-    if placed.stable_pose < 0:
-        return placed.T_board_object[:2, 3], distractors()[placed.name].radius_m
-    corners = apply(placed.T_board_object, parts[placed.name].mesh.convex_hull.vertices)[:, :2]
-    centre = (placed.T_board_object @ inverse(rest_of(placed, parts)))[:2, 3]
-    return centre, np.linalg.norm(corners - centre, axis=1).max()
-
-
-def rest_of(placed, parts):
-    """The stable pose that a part lies in; a lean of a tenth of a degree moves its footprint by micrometres."""
-    return parts[placed.name].stable_poses[placed.stable_pose].T_table_part
-
-
-def gaps(shot, slider, within=0.02):
-    """Distance in m of every pair of things that are near each other."""
-    things = [*shot.parts, *shot.distractors]
-    for a, b in combinations(things, 2):
-        if np.linalg.norm((a.T_board_object - b.T_board_object)[:2, 3]) < within:
-            yield a, b, slider.distance((a.name, a.T_board_object), (b.name, b.T_board_object))
 
 
 @pytest.mark.parametrize("faces", ["physics", "uniform"])
@@ -192,81 +142,6 @@ def test_parts_lie_in_their_area_and_distractors_on_the_plate(pool, parts, range
             assert (np.abs(centre) + radius <= half + 1e-12).all()
 
 
-def test_things_keep_their_distance_unless_they_are_pushed_together(pool, parts, slider):
-    ranges = replace(TRAIN_SHOTS, touching=0.0, close=0.0)
-    sampler = ShotSampler(pool, ranges)
-    for shot in [*shots(sampler.crop, 150), *shots(sampler.window, 40), *frames(sampler, 10)]:
-        circles = [footprint(placed, parts) for placed in (*shot.parts, *shot.distractors)]
-        for (a, r), (b, s) in combinations(circles, 2):
-            assert np.linalg.norm(a - b) > r + s + ranges.gap_m[0] - 1e-4
-    for sampler, ranges in ((ShotSampler(pool), TRAIN_SHOTS), (ShotSampler(pool, TEST_SHOTS), TEST_SHOTS)):
-        apart = [gap for shot in shots(sampler.crop, 150) for _, _, gap in gaps(shot, slider)]
-        assert min(apart) > 0.9 * TOUCH_M
-        kinds = Counter(
-            "touching" if gap < 3e-5 else "close" if gap < ranges.close_gap_m[1] else "apart" for gap in apart
-        )
-        assert kinds["touching"] > 0 and kinds["close"] > 0 and kinds["apart"] > 0
-        assert not any(3e-5 < gap < ranges.close_gap_m[0] for gap in apart)
-
-
-def test_test_shots_hold_more_that_touches_than_training_shots(pool, slider):
-    def share(ranges):
-        crops = [list(gaps(shot, slider)) for shot in shots(ShotSampler(pool, ranges).crop, 300)]
-        return np.mean([any(gap < 3e-5 for *_, gap in crop) for crop in crops])
-
-    assert share(TEST_SHOTS) > 1.5 * share(TRAIN_SHOTS) > 0
-
-
-def test_what_is_pushed_together_touches_and_overlaps_nothing(pool, slider):
-    touched = 0
-    for shot in shots(ShotSampler(pool, TOUCHING).crop, 150):
-        for _, _, gap in gaps(shot, slider):
-            assert -1e-6 < gap <= 3e-5
-            touched += 1
-    assert touched > 50
-
-
-def test_touching_parts_stay_where_they_are(pool):
-    pairs = [
-        shot.parts for shot in shots(ShotSampler(pool, TOUCHING, faces="uniform").crop, 30) if len(shot.parts) == 2
-    ]
-    for first, second in pairs[:12]:
-        names, placed = (first.name, second.name), np.array([first.T_board_object, second.T_board_object])
-        model = build_board_scene(CELL, names).compile()
-        data = mujoco.MjData(model)
-        set_parts(model, data, CELL.T_world_board @ placed)
-        mujoco.mj_step(model, data, round(0.3 / model.opt.timestep))
-        for i in range(2):
-            body = model.body(part_body(i)).id
-            T = inverse(CELL.T_world_board) @ transform(data.xmat[body].reshape(3, 3), data.xpos[body])
-            assert np.linalg.norm(T[:3, 3] - placed[i, :3, 3]) < 20e-6
-
-
-@pytest.mark.parametrize("gap_m", [TOUCH_M, 1e-3])
-def test_a_slide_ends_at_the_gap_and_passes_what_is_not_in_its_way(slider, pool, parts, gap_m):
-    rng = np.random.default_rng(5)
-    for _ in range(40):
-        a, b = rng.choice(list(parts), 2)
-        T_a, T_b = (pool.draw(parts[name], "uniform", rng).T_table_part for name in (a, b))
-        T_a, T_b = planar(-0.03, rng.uniform(-4e-3, 4e-3), rng.uniform(-3, 3)) @ T_a, planar(0, 0, 1.0) @ T_b
-        travel = slider.travel((a, T_a), (b, T_b), np.array([1.0, 0.0]), gap_m)
-        if travel is None:
-            continue
-        gap = slider.distance((a, planar(travel, 0, 0) @ T_a), (b, T_b))
-        assert gap_m - 1e-7 < gap < gap_m + 1.1e-5
-    assert slider.travel((a, planar(-0.03, 0.02, 0.0) @ T_a), (b, T_b), np.array([1.0, 0.0])) is None
-
-
-def test_a_slide_of_boxes_is_exact(slider):
-    """Two blocks, 9 x 7 and 5 x 4 mm, with faces parallel; and the second turned by 45 degrees, corner first."""
-    far = planar(-0.05, 0, 0)
-    direction = np.array([1.0, 0.0])
-    flat = slider.travel(("block_1", far), ("block_0", np.eye(4)), direction)
-    assert flat == pytest.approx(0.05 - 4.5e-3 - 2.5e-3, abs=1.3e-5)
-    corner = slider.travel(("block_1", far @ planar(0, 0, np.pi / 4)), ("block_0", np.eye(4)), direction)
-    assert corner == pytest.approx(0.05 - 4.5e-3 - np.sqrt(0.5) * 4.5e-3, abs=1.3e-5)
-
-
 @pytest.mark.parametrize("kind", ["crop", "window", "frame"])
 def test_the_same_seed_gives_the_same_shots(pool, kind):
     def drawn(seed):
@@ -310,43 +185,6 @@ def test_no_image_holds_more_parts_than_announced_nor_a_distractor_twice(pool):
 def test_without_distractors_there_are_none(pool):
     sampler = ShotSampler(pool, others={})
     assert not any(shot.distractors for shot in [*shots(sampler.crop, 30), *frames(sampler, 3)])
-
-
-def test_distractors_stand_steadily_on_the_board():
-    for thing in distractors().values():
-        low = thing.mesh.bounds[0, 2]
-        assert abs(low) < 1e-9
-        assert thing.mesh.extents.max() < 0.025
-        corners = np.concatenate([piece.vertices for piece in thing.pieces])
-        sides = ConvexHull(corners[corners[:, 2] < 1e-6, :2]).equations
-        volumes = np.array([piece.volume for piece in thing.pieces])
-        centre = volumes @ [piece.center_mass for piece in thing.pieces] / volumes.sum()
-        assert (sides[:, :2] @ centre[:2] + sides[:, 2] < -5e-6).all(), thing.name
-
-
-def test_the_pieces_of_a_distractor_hold_what_is_drawn():
-    for thing in distractors().values():
-        drawn, pieces = thing.mesh.bounds, np.array([piece.bounds for piece in thing.pieces])
-        held = np.array([pieces[:, 0].min(axis=0), pieces[:, 1].max(axis=0)])
-        np.testing.assert_allclose(drawn, held, atol=6e-5, err_msg=thing.name)
-        assert all(piece.is_convex for piece in thing.pieces), thing.name
-
-
-def test_distractors_are_of_many_kinds_and_always_the_same():
-    kinds = Counter(thing.kind for thing in distractors().values())
-    assert len(kinds) >= 20
-    assert {"screw", "nut", "washer", "chip", "wire", "coin", "paper", "ring", "channel", CRUMB} <= kinds.keys()
-    assert list(distractor_meshes()) == list(distractors())
-
-
-def test_a_distractor_that_could_be_a_part_is_left_out(parts):
-    block = distractors()["block_0"]
-    part = replace(parts["main"], name="block", mesh=block.mesh)
-    assert block.resembles(part)
-    assert not any(thing.resembles(parts[name]) for thing in distractors().values() for name in parts)
-    pool = RestPool.make([parts["main"]])
-    pool.parts = (part,)
-    assert "block_0" not in Shelf(pool, distractors()).distractors
 
 
 def test_a_point_of_the_board_is_where_its_pixel_shows_it():
