@@ -71,7 +71,9 @@ class Labeller:
     ) -> tuple[tuple[int, int], NDArray[np.bool_], NDArray[np.bool_]] | None:
         """Corner, silhouette and visible pixels of one part, None when all of it is beyond the image."""
         outline = outlines[geom]
-        low, high = np.floor(outline.min(axis=0)).astype(int), np.ceil(outline.max(axis=0)).astype(int) + 1
+        reach = 0 if self._stage.lens.straight else 1  # a distorted outline bends, and its pixels are the nearest ones
+        low = np.floor(outline.min(axis=0)).astype(int) - reach
+        high = np.ceil(outline.max(axis=0)).astype(int) + 1 + reach
         size = np.array([camera.width, camera.height])
         if (high <= 0).any() or (low >= size).any():
             return None
@@ -96,14 +98,16 @@ class Labeller:
         model.geom_group[:] = HIDDEN_GROUP
         model.geom_group[geom] = groups[geom]
         out = np.zeros((high[1] - low[1], high[0] - low[0]), bool)
-        for y in range(0, out.shape[0], camera.height):
-            for x in range(0, out.shape[1], camera.width):
-                tile = out[y : y + camera.height, x : x + camera.width]
-                window = camera.crop(int(low[0]) + x, int(low[1]) + y, tile.shape[1], tile.shape[0])
-                drawn = self._stage.render(window, ("instances",)).instances
-                assert drawn is not None
-                tile[:] = drawn == instance
-        model.geom_group[:] = groups
+        try:
+            for y in range(0, out.shape[0], camera.height):
+                for x in range(0, out.shape[1], camera.width):
+                    tile = out[y : y + camera.height, x : x + camera.width]
+                    window = camera.crop(int(low[0]) + x, int(low[1]) + y, tile.shape[1], tile.shape[0])
+                    drawn = self._stage.render(window, ("instances",)).instances
+                    assert drawn is not None
+                    tile[:] = drawn == instance
+        finally:
+            model.geom_group[:] = groups
         return out
 
     def _outline(self, geom: int, T_cam_board: Array, camera: Intrinsics) -> NDArray[np.float32]:

@@ -116,12 +116,14 @@ def _check_info(
         return
     if info["px_count_all"] < whole.sum():
         findings.add(path, f"object {k}: px_count_all {info['px_count_all']}, mask {whole.sum()}", REDRAW, image)
-    inside, told = mask_box(whole), np.array(info["bbox_obj"])
-    if inside != NO_BOX and tuple(told) != NO_BOX:
-        limits = np.array([*whole.shape[::-1]]) - 1
-        low, high = np.clip(told[:2], 0, limits), np.clip(told[:2] + told[2:], 0, limits)
-        if not _same_box(np.array([*low, *(high - low)]), np.array(inside)):
-            findings.add(path, f"object {k}: bbox_obj {told.tolist()}, mask {list(inside)}", REDRAW, image)
+    inside, told = np.array(mask_box(whole)), np.array(info["bbox_obj"])
+    if inside[0] < 0 or told[0] == NO_BOX[0] == told[2]:
+        return
+    last = np.array(whole.shape[::-1]) - 1
+    cut = (told[:2] < 0).any() or (told[:2] + told[2:] > last).any()
+    holds = (told[:2] <= inside[:2]).all() and (told[:2] + told[2:] >= inside[:2] + inside[2:]).all()
+    if not (holds if cut else _same_box(told, inside)):
+        findings.add(path, f"object {k}: bbox_obj {told.tolist()}, mask {inside.tolist()}", REDRAW, image)
 
 
 def _same_box(told: NDArray[Any], box: NDArray[Any]) -> bool:
