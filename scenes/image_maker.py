@@ -92,6 +92,11 @@ class ImageMaker:
             depth_m=drawn.depth_m if config.depth else None,
         )
 
+    @property
+    def stage(self) -> Stage:
+        """What the images are rendered from."""
+        return self._stage
+
     def close(self) -> None:
         """Free the renderer."""
         self._stage.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cad.parts import Part
 from cad.spatial import Array, rotation_from_rotvec, rotation_x, rotation_z, transform
@@ -18,7 +19,7 @@ from scenes.ranges import LensRanges, LookRanges, Range, SensorRanges, ViewRange
 from scenes.sensor import SensorConfig, noise_levels
 
 LIGHTS = 3
-GOLD = (0.95, 0.78, 0.42)
+GOLD = (0.98, 0.87, 0.60)
 """Colour of gold plating, encoded as cameras deliver it."""
 DARK_METAL = 0.4
 """A metal whose nominal colour is darker than this is blackened: never taken for one that is gold plated."""
@@ -181,11 +182,14 @@ def draw_distractor_surface(ranges: LookRanges, rng: np.random.Generator) -> Sur
 
 
 def _surface(rgb: Array, metallic: float, roughness: float, highlight: float = 1.0) -> Surface:
-    """A surface whose classic finish follows from its physical one; ``highlight`` scales the strength of highlights."""
+    """A surface whose classic finish follows from its physical one; ``highlight`` scales the strength of highlights.
+
+    A colour that would reflect more than all light is darkened, so that it keeps its hue.
+    """
     metallic, roughness = float(metallic), float(np.clip(roughness, *ROUGHNESS))
     specular, shininess = classic_finish(metallic, roughness)
     return Surface(
-        rgb=_triple(np.clip(rgb, 0.0, 1.0)),
+        rgb=_triple(np.maximum(rgb, 0.0) / max(float(rgb.max()), 1.0)),
         metallic=metallic,
         roughness=roughness,
         specular=float(min(specular * highlight, 1.0)),
@@ -198,9 +202,15 @@ def draw_camera(ranges: ViewRanges, rng: np.random.Generator) -> Array:
     shift = rng.uniform(-ranges.shift_m, ranges.shift_m, 2)
     height = rng.uniform(*ranges.height_m)
     yaw = np.radians(rng.uniform(-ranges.yaw_deg, ranges.yaw_deg))
-    tilt = np.radians(rng.uniform(-ranges.tilt_deg, ranges.tilt_deg, 2))
-    R = rotation_z(yaw) @ rotation_x(np.pi) @ rotation_from_rotvec([tilt[0], tilt[1], 0.0])
-    return transform(R, [*shift, height])
+    return camera_above(height, yaw, np.radians(rng.uniform(-ranges.tilt_deg, ranges.tilt_deg, 2)), shift)
+
+
+def camera_above(
+    height_m: float, yaw: float = 0.0, tilt: ArrayLike = (0.0, 0.0), shift_m: ArrayLike = (0.0, 0.0)
+) -> Array:
+    """``T_board_cam`` (4, 4) of a camera that looks down, turned and tilted (2,) by rad, shifted by (2,) m."""
+    R = rotation_z(yaw) @ rotation_x(np.pi) @ rotation_from_rotvec([*np.asarray(tilt), 0.0])
+    return transform(R, [*np.asarray(shift_m), height_m])
 
 
 def draw_sensor(ranges: SensorRanges, brightest: float, rng: np.random.Generator) -> SensorConfig:

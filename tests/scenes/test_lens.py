@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from cad.parts import load_part
-from cad.spatial import BASLER, Intrinsics, apply, inverse
+from cad.spatial import BASLER, apply, inverse
 from cad.tagboard import TagboardConfig
 from scenes.errors import SceneError
 from scenes.lens import Lens, Warp, magnified
-from scenes.randomize import draw_lens
-from scenes.ranges import LensRanges
+from scenes.randomize import DEFAULT_LOOK, camera_above, draw_lens
+from scenes.ranges import LensRanges, LookRanges
+from scenes.shots import Shot
+from scenes.stage import Stage, StageConfig
 
 LENS = Lens(k1=-0.08, k2=0.05, p1=0.001, p2=-0.002)
 
@@ -116,8 +118,6 @@ def test_drawn_lenses_keep_their_ranges():
 
 @pytest.fixture(scope="module")
 def stage():
-    from scenes.stage import Stage, StageConfig
-
     stage = Stage(
         [load_part("main")], [], StageConfig(slots=1, max_size=(200, 200), shadow_half_m=0.02, shadow_size=256)
     )
@@ -127,12 +127,8 @@ def stage():
 
 def test_a_stage_is_seen_through_its_lens(stage):
     """A tag near the frame's corner: its printed corners are found where the lens projects them; tiles join."""
-    from scenes.randomize import DEFAULT_LOOK
-    from scenes.ranges import LookRanges
-    from scenes.shots import Shot
-    from scenes.stage import _above  # the camera straight above the board
 
-    board, T_board_cam = TagboardConfig(), _above()
+    board, T_board_cam = TagboardConfig(), camera_above(0.7)
     tag = board.ids[0]
     x, y = board.centre(tag)
     half = board.tag_m / 2
@@ -160,5 +156,3 @@ def test_a_stage_is_seen_through_its_lens(stage):
     assert np.abs(found - corners).max() < 0.15
     pinhole = camera.project(p_cam) - low
     assert np.abs(pinhole - corners[:, 0]).max() > 2.0
-    stage.lens = Lens()
-    assert isinstance(window, Intrinsics)
