@@ -65,7 +65,7 @@ def _stain(rng: np.random.Generator) -> Image:
     centre, radius = rng.uniform(0, SIZE, 2), rng.uniform(15, 90)
     distance = np.hypot(x - centre[0], y - centre[1]) / radius + 0.25 * _noise(rng, (9, 9))
     rim = np.exp(-(((distance - 0.92) / 0.07) ** 2))
-    return (0.6 / (1 + np.exp(20 * (distance - 1))) + 0.4 * rim).astype(np.float32)
+    return (0.6 / (1 + np.exp(np.minimum(20 * (distance - 1), 80))) + 0.4 * rim).astype(np.float32)
 
 
 def _finish(pattern: Image, rng: np.random.Generator) -> NDArray[np.uint8]:
