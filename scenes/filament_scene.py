@@ -17,10 +17,13 @@ HEADROOM = 1.5
 WHITE = np.pi * 1.2 * 2**15 / HEADROOM
 """Illuminance (lux) that makes a white matt surface saturate the sensor: Filament's own exposure (f/16, 1/125 s, ISO
 100) saturates at 1.2 * 2**15 candela a square metre."""
-DIRECTIONAL_DISTANCE_M = 1.0
-"""Directional light comes from a spot this far before the point of its axis that is nearest to the light's body:
-Filament has only one directional light, and fits its shadows to the window that is drawn."""
-RANGE_M = 10.0
+SCALE = 20.0
+"""Filament's units a metre. It keeps shadows a thousandth of a unit away from what casts them."""
+DIRECTIONAL_DISTANCE = 1.0 * SCALE
+RANGE = 10.0 * SCALE
+SHADOW_COARSENING = 2
+"""Shadow maps are this much coarser than the classic renderer's: Filament smooths their borders over a texel, which
+should be about a pixel as there is one sample of a shadow a pixel."""
 PLAIN_FACE = 4
 """Pixels along each side of a face of a plain surround."""
 SOFT_RIM = 0.02
@@ -50,6 +53,8 @@ class FilamentScene:
         self._renderables = [self._renderable(i) for i in range(model.ngeom)]
         self._textures: dict[int, mjrf.Texture] = {}
         self._finishes: dict[int, Finish] = {}
+        self._sun = context.create_light(mjrf.LightParams(type=mjrf.LightType.LIGHT_DIRECTIONAL))
+        self.scene.add_light(self._sun)
         self._lamps: dict[str, mjrf.Light] = {}
         self._cubes: dict[object, mjrf.Texture] = {}
         self._surround: tuple[object, mjrf.Light] | None = None
@@ -58,12 +63,12 @@ class FilamentScene:
         """Make the scene what the model and its forwarded data say now."""
         description = self._reader.read(data)
         self._place(description.geoms)
-        self._light(data, description.lamps)
+        self._light(description.lamps)
         self._surround_with(description)
 
     def _renderable(self, geom: int) -> mjrf.Renderable:
         renderable = self._meshes.get_renderable(_GEOM, geom)
-        renderable.set_size(_half_size(self._model, geom).astype(np.float32))
+        renderable.set_size((SCALE * _half_size(self._model, geom)).astype(np.float32))
         renderable.set_cast_shadow(bool(self._model.geom_castshadow[geom]))
         return renderable
 
@@ -74,7 +79,7 @@ class FilamentScene:
             del self._finishes[i]
         for drawn in geoms:
             i, renderable = drawn.geom, self._renderables[drawn.geom]
-            position = drawn.T_world_geom[:3, 3].astype(np.float32)
+            position = (SCALE * drawn.T_world_geom[:3, 3]).astype(np.float32)
             renderable.set_pose(position, drawn.T_world_geom[:3, :3].ravel().astype(np.float32))
             if i not in self._finishes:
                 self.scene.add_renderable(renderable)
@@ -94,33 +99,54 @@ class FilamentScene:
             material.color_texture = self._texture(finish.texture)
         return material
 
-    def _light(self, data: mujoco.MjData, lamps: tuple[DrawnLamp, ...]) -> None:
-        for name in self._lamps.keys() - {lamp.name for lamp in lamps}:
+    def _light(self, lamps: tuple[DrawnLamp, ...]) -> None:
+        """The first lamp that casts shadows is Filament's one directional light; the others cast none."""
+        model = self._model
+        casting = (lamp for lamp in lamps if model.light(lamp.name).castshadow)
+        sun = next(casting, None)
+        self._shine(sun)
+        others = {lamp.name: lamp for lamp in lamps if lamp is not sun}
+        for name in self._lamps.keys() - others.keys():
             self.scene.remove_light(self._lamps.pop(name))
-        for lamp in lamps:
-            if lamp.name not in self._lamps:
+        for name, lamp in others.items():
+            if name not in self._lamps:
                 point = lamp.kind == "point"
                 kind = mjrf.LightType.LIGHT_POINT if point else mjrf.LightType.LIGHT_SPOT
-                self._lamps[lamp.name] = self._context.create_light(
-                    mjrf.LightParams(type=kind, range=RANGE_M, softness=SOFT_RIM)
-                )
-                self.scene.add_light(self._lamps[lamp.name])
-            self._aim(data, self._lamps[lamp.name], lamp)
+                params = mjrf.LightParams(type=kind, range=RANGE, softness=SOFT_RIM, cast_shadow=False)
+                self._lamps[name] = self._context.create_light(params)
+                self.scene.add_light(self._lamps[name])
+            self._aim(self._lamps[name], lamp)
 
-    def _aim(self, data: mujoco.MjData, light: mjrf.Light, lamp: DrawnLamp) -> None:
+    def _shine(self, lamp: DrawnLamp | None) -> None:
+        """Light and shadows of a lamp, parallel and as strong everywhere as at the middle of the scene."""
+        self._sun.set_cast_shadow(lamp is not None)
+        if lamp is None:
+            self._sun.set_intensity(0.0)
+            return
+        away = 1.0 if lamp.kind == "directional" else float(np.linalg.norm(self._aimed_at(lamp) - lamp.position))
+        brightest = max(*lamp.rgb, 1e-9)
+        self._sun.set_pose((SCALE * lamp.position).astype(np.float32), lamp.direction.astype(np.float32))
+        self._sun.set_color((np.array(lamp.rgb) / brightest).astype(np.float32))
+        self._sun.set_intensity(brightest / away**2 * WHITE)
+        self._sun.set_shadow_map_size(int(self._model.vis.quality.shadowsize) // SHADOW_COARSENING)
+
+    def _aim(self, light: mjrf.Light, lamp: DrawnLamp) -> None:
+        """A lamp without shadows. Directional light comes from a spot some way from the middle of the scene."""
         model = self._model
-        i = model.light(lamp.name).id
-        position, cutoff = lamp.position, lamp.cutoff
+        position, strength, cutoff = SCALE * lamp.position, SCALE**2, lamp.cutoff
         if lamp.kind == "directional":
-            position = _axis_origin(model, data, lamp, i) - DIRECTIONAL_DISTANCE_M * lamp.direction
-            cutoff = np.arctan(np.sqrt(2) * model.vis.map.shadowclip * model.stat.extent / DIRECTIONAL_DISTANCE_M)
+            position = SCALE * self._aimed_at(lamp) - DIRECTIONAL_DISTANCE * lamp.direction
+            strength = DIRECTIONAL_DISTANCE**2
+            cutoff = np.arctan(2 * SCALE * model.vis.map.shadowclip * model.stat.extent / DIRECTIONAL_DISTANCE)
         brightest = max(*lamp.rgb, 1e-9)
         light.set_pose(position.astype(np.float32), lamp.direction.astype(np.float32))
         light.set_color((np.array(lamp.rgb) / brightest).astype(np.float32))
-        light.set_intensity(brightest * WHITE)
+        light.set_intensity(brightest * strength * WHITE)
         light.set_cutoff(np.degrees(cutoff))
-        light.set_cast_shadow(bool(model.light_castshadow[i]))
-        light.set_shadow_map_size(int(model.vis.quality.shadowsize))
+
+    def _aimed_at(self, lamp: DrawnLamp) -> Array:
+        """The point on a lamp's axis that is nearest to the middle of the scene, which is ``stat.center``."""
+        return lamp.position + lamp.direction * ((self._model.stat.center - lamp.position) @ lamp.direction)
 
     def _surround_with(self, description: SceneDescription) -> None:
         """Light from all around: the model's environment, else a uniform one of the headlight's ambient colour."""
@@ -171,11 +197,6 @@ class FilamentScene:
         return texture
 
 
-def _axis_origin(model: mujoco.MjModel, data: mujoco.MjData, lamp: DrawnLamp, i: int) -> Array:
-    """The point on a lamp's axis that is nearest to its body."""
-    return lamp.position + lamp.direction * ((data.xpos[model.light_bodyid[i]] - lamp.position) @ lamp.direction)
-
-
 def _half_size(model: mujoco.MjModel, i: int) -> Array:
     """What a geom's unit mesh is stretched by (3,); meshes have their own size."""
     kind, size = mujoco.mjtGeom(model.geom_type[i]), model.geom_size[i]
@@ -184,7 +205,7 @@ def _half_size(model: mujoco.MjModel, i: int) -> Array:
     if kind in (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE):
         return np.array([size[0], size[0], size[1]])
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        return np.array([*size[:2], 1.0])
+        return np.array([*size[:2], 1 / SCALE])
     return size if kind == mujoco.mjtGeom.mjGEOM_BOX else np.ones(3)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cad.spatial import Array, Intrinsics
 from scenes.coverage import antialias
-from scenes.filament_scene import HEADROOM, FilamentScene
+from scenes.filament_scene import HEADROOM, SCALE, FilamentScene
 from scenes.gl import mujoco
 
 # isort: split
@@ -114,11 +114,12 @@ class FilamentView:
         return target, read, image
 
     def _camera(self, window: Intrinsics) -> mjrf.Camera:
-        T, (near, far) = self._T_world_cam, self._planes
+        T = self._T_world_cam
+        near, far = (SCALE * plane for plane in self._planes)
         left, right = (near * (u - window.cx) / window.fx for u in (-0.5, window.width - 0.5))
         top, bottom = (near * (window.cy - v) / window.fy for v in (-0.5, window.height - 0.5))
         return mjrf.Camera(
-            pos=T[:3, 3].astype(np.float32),
+            pos=(SCALE * T[:3, 3]).astype(np.float32),
             forward=T[:3, 2].astype(np.float32),
             up=-T[:3, 1].astype(np.float32),
             frustum_center=(left + right) / 2,

@@ -189,6 +189,7 @@ class Stage:
         model, data = self.model, self.data
         model.vis.headlight.ambient[:] = look.ambient
         target = np.array([*focus, 0.0])
+        model.stat.center[:] = target
         for i in range(LIGHTS):
             model.light_active[i] = i < len(look.lamps)
             if i >= len(look.lamps):
