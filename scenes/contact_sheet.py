@@ -15,7 +15,7 @@ from scenes.image_maker import ENVIRONMENTS, TEXTURES, WORN_TAGS, ImageMaker, La
 from scenes.sheet_rows import COLUMNS, TILE, Image, Row, RowMaker, SheetRanges
 
 ROWS = 27
-"""Rows that vary one range each; a physically based domain has one more."""
+"""Rows that vary one range each; one more in a physically based domain, one less where all parts are alike."""
 DRAWN_ROWS = 4
 """Rows of images drawn from all ranges; the contours of their labels are marked on every other one."""
 CAPTION_PX, GAP_PX = 156, 2

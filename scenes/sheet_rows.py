@@ -27,6 +27,8 @@ COLUMNS, TILE = 6, 120
 SEED = 5
 NEIGHBOUR_M = (0.0095, 0.003)
 """Where the second part lies."""
+ENVIRONMENT_LEVEL = 0.6
+"""Light from all around where it is the only light."""
 SHOWN_LENS = 0.1
 """Radial distortion that is shown, either way, where a data set has none."""
 
@@ -88,19 +90,24 @@ class RowMaker:
         yield self._sweep("light all round", "ambient")
         if self._ranges.physical:
             yield self._sweep("lamp radius, m", "lamp_radius_m")
-            looks = [replace(self._drawn(self._look), environment=k) for k in range(COLUMNS)]
-            caption = ("environments: tent,", "soft boxes, strips,", "windows, lab,", "ring light")
+            bare = replace(self._drawn(self._look), lamps=(), ambient=ENVIRONMENT_LEVEL)
+            looks = [replace(bare, environment=k) for k in range(COLUMNS)]
+            caption = ("environments alone:", "tent, soft boxes,", "strips, windows,", "lab, ring light")
             yield Row(caption=caption, tiles=[self._tile(self._wide, look) for look in looks])
         else:
             yield self._sweep("lamp highlights", "lamp_specular", self._glossy)
 
     def _materials(self) -> Iterator[Row]:
-        yield self._sweep("metal brightness", "metal_level")
-        yield self._sweep("plastic brightness", "plastic_level")
-        yield self._sweep("roughness, x nominal", "roughness", self._glossy)
+        metals = [part.metallic > 0.5 for part in self._parts[:2]]
+        if any(metals):
+            yield self._sweep("metal brightness", "metal_level")
+        if not all(metals):
+            yield self._sweep("plastic brightness", "plastic_level")
         if self._ranges.physical:
-            yield self._sweep("metalness", "metallic", self._glossy)
+            yield self._sweep("roughness, x nominal", "roughness")
+            yield self._sweep("plate roughness", "board_roughness", self._glossy)
         else:
+            yield self._sweep("roughness, x nominal", "roughness", self._glossy)
             yield self._sweep("highlights, x nominal", "specular", self._glossy)
         own = self._ranges.look
         names = ("metal_level", "plastic_level", "colour_exponent", "roughness", "metal_tint", "plastic_tint")

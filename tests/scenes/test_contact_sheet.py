@@ -12,7 +12,7 @@ from scenes.errors import SceneError
 from scenes.ranges import LookRanges, SensorRanges, ViewRanges
 from scenes.sheet_rows import COLUMNS, TILE, ends, middle
 
-CONFIG = DatasetConfig(kind="crop", parts=("main",))
+CONFIG = DatasetConfig(kind="crop", parts=("inserted", "main"))
 
 
 @pytest.fixture(scope="module")
