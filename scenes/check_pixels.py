@@ -193,5 +193,5 @@ def model_depth(mesh: trimesh.Trimesh, truth: dict[str, Any], camera: dict[str, 
     origins = np.tile(-R.T @ t, (len(rays), 1))
     hit, ray, _ = mesh.ray.intersects_location(origins, rays @ R, multiple_hits=True)
     z = np.full(len(rays), np.inf)
-    np.minimum.at(z, ray, hit @ R[2] + t[2])
+    np.minimum.at(z, ray, np.reshape(hit, (-1, 3)) @ R[2] + t[2])
     return np.where(np.isfinite(z), z, np.nan)
