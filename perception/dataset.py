@@ -44,7 +44,9 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropSet:
-    """N crops, each with at most one target part; ``obj_id`` is 0 and the pose the identity where there is none."""
+    """N crops, each with at most one target part, the first of its list; ``obj_id`` is 0 and the pose the identity where
+    there is none, or nothing is seen of it.
+    """
 
     images: NDArray[np.uint8]  # (N, H, W, 3) RGB
     obj_id: NDArray[np.int64]  # (N,)
@@ -193,16 +195,16 @@ def _read_images(entries: Sequence[Entry]) -> NDArray[np.uint8]:
 def _read_crops(data_dir: Path) -> CropSet:
     entries = read_entries(data_dir)
     images = _read_images(entries)
-    targets = [e.instances[0] if e.instances else None for e in entries]
+    targets = [e.instances[0] if e.places[:1] == [0] else None for e in entries]
     empty = np.zeros(images.shape[1:3], bool)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        masks = pool.map(lambda e: np.packbits(e.mask(0) if e.instances else empty, axis=-1), entries)
+        masks = pool.map(lambda e, t: np.packbits(e.mask(0) if t else empty, axis=-1), entries, targets)
         packed = np.stack(list(masks))
     return CropSet(
         images=images,
         obj_id=np.array([t["obj_id"] if t else 0 for t in targets], np.int64),
         stable_pose=np.array([t["stable_pose"] if t else -1 for t in targets], np.int64),
-        T_cam_part=np.stack([e.T_cam_part(0) if e.instances else np.eye(4) for e in entries]),
+        T_cam_part=np.stack([e.T_cam_part(0) if t else np.eye(4) for e, t in zip(entries, targets, strict=True)]),
         T_cam_board=np.stack([e.T_cam_board for e in entries]),
         K=np.stack([e.K for e in entries]),
         packed_masks=packed,

@@ -208,6 +208,9 @@ def test_parts_of_which_nothing_is_seen_are_left_out(tmp_path: Path) -> None:
     assert windows.stable_pose.tolist() == [0, 0]
     assert windows.instance_map[0, 8, 0] == 1 and windows.instance_map[0, 8, 20] == 2
     assert (windows.instance_map > 0).sum() == 50
+    shown.annotations[0] = replace(shown.annotations[0], visible=np.zeros((5, 5), bool))
+    crops = load_crops(write_data_set(tmp_path / "crops", "test", PARTS, [shown]))
+    assert crops.obj_id.tolist() == [0] and not crops.masks().any()
 
 
 def test_jpeg_files_are_read(tmp_path: Path) -> None:
