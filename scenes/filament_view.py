@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.spatial import Array, Intrinsics
+from cad.spatial import BASLER, Array, Intrinsics
 from scenes.coverage import antialias
 from scenes.filament_scene import HEADROOM, SCALE, FilamentScene
 from scenes.gl import mujoco
@@ -26,6 +27,8 @@ SAMPLES = np.array([(x + s, y + s) for s in SHIFTS for y in (-0.25, 0.25) for x 
 """(8, 2) pixels right and down of the centre: two grids of 2 x 2, with 4 different places along either axis."""
 
 
+REACH = (0.02 + BASLER.width / 2 / BASLER.fx, 0.02 + BASLER.height / 2 / BASLER.fy)
+"""Tangents of half the angles of the camera's whole view, with room for windows that go a little beyond the frame."""
 MARGIN = 1
 """Pixels drawn round a window, whose colours the antialiasing of its border needs."""
 _INSIDE = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
@@ -91,8 +94,9 @@ class FilamentView:
         target, read, image = self._target(window, pixels)
         request = mjrf.RenderRequest()
         request.scene, request.target, request.draw_mode = self._scene.scene, target, mode
-        request.camera = self._camera(window)
-        request.viewport = mjrf.Rect(left=0, bottom=0, width=window.width, height=window.height)
+        left, top, width, height = _whole(window)
+        request.camera = self._camera(window.crop(left, top, width, height))
+        request.viewport = mjrf.Rect(left=left, bottom=window.height - top - height, width=width, height=height)
         request.post_processing = request.reflections = request.skybox = request.haze = False
         request.shadows = mode == _MODE.DRAW_MODE_DEFAULT
         self._context.wait_for_frame(self._context.render([request], [read]))
@@ -129,6 +133,17 @@ class FilamentView:
             frustum_near=near,
             frustum_far=far,
         )
+
+
+def _whole(window: Intrinsics) -> tuple[int, int, int, int]:
+    """Left, top, width and height, in a window's pixels, of the camera's whole view round it.
+
+    Filament fits shadow maps to what it is told to draw. It is told to draw the whole view, of which only the window
+    lies in the target, so that shadows are the same in every window.
+    """
+    half_width = math.ceil(max(REACH[0] * window.fx, window.cx + 1, window.width - window.cx))
+    half_height = math.ceil(max(REACH[1] * window.fy, window.cy + 1, window.height - window.cy))
+    return math.floor(window.cx) - half_width, math.floor(window.cy) - half_height, 2 * half_width, 2 * half_height
 
 
 def _doubled(window: Intrinsics, shift: float) -> Intrinsics:
