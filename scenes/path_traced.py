@@ -38,6 +38,8 @@ STRIDE = 1_000_003
 SPECK_FACTOR, SPECK_LEVEL = 1.5, 0.1
 SAMPLES_AT_ONCE = 1 << 24
 """Larger windows are drawn in bands of rows, which bounds the memory that a render takes."""
+SCENE = {"type": "scene", "embree_use_robust_intersections": True}
+"""Rays do not slip through between two triangles."""
 SMOOTHEST = 0.03
 """Roughness below which highlights of lamps would be too bright to average."""
 MM = 1000.0
@@ -88,10 +90,10 @@ class MitsubaRenderer:
         shapes = {f"geom_{geom.geom:05d}": self._shape(geom, view, used) for geom in scene.geoms}
         rgb = instances = depth = None
         if "rgb" in what:
-            lit = self._mi.load_dict({"type": "scene", **shapes, **self._lights(scene, view, used)})
+            lit = self._mi.load_dict({**SCENE, **shapes, **self._lights(scene, view, used)})
             rgb = self._draw_colours(lit, view)
         if "instances" in what or "depth" in what:
-            bare = self._mi.load_dict({"type": "scene", **shapes})
+            bare = self._mi.load_dict({**SCENE, **shapes})
             drawn = self._draw(bare, self._labels, view, 1, 0)
             geom = self._geom_order(bare)[drawn[..., 3].astype(np.int64)]
             if "instances" in what:
@@ -202,7 +204,7 @@ class MitsubaRenderer:
         return lights
 
     def _environment(self, texture: int, radiance: float) -> Any:
-        upright = self._mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+        upright = self._mi.ScalarTransform4f().rotate([1, 0, 0], 90).rotate([0, 1, 0], 180)
         panorama = self._mi.Bitmap(environment_panorama(self._model, texture))
         return self._mi.load_dict({"type": "envmap", "bitmap": panorama, "scale": radiance, "to_world": upright})
 
