@@ -44,8 +44,9 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropSet:
-    """N crops, each with at most one target part, the first of its list; ``obj_id`` is 0 and the pose the identity where
-    there is none, or nothing is seen of it.
+    """N crops, each with at most one target part, the first of its list.
+
+    Where there is none, or nothing is seen of it, ``obj_id`` is 0 and the pose the identity.
     """
 
     images: NDArray[np.uint8]  # (N, H, W, 3) RGB
