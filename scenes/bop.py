@@ -168,9 +168,9 @@ def write_models(folder: Path, parts: Sequence[Part]) -> None:
         mesh.apply_scale(1e3)
         mesh.export(models / f"obj_{part.obj_id:06d}.ply", vertex_normal=True, encoding="ascii")
         low, size = mesh.bounds[0], mesh.extents
-        info: dict[str, Any] = {"diameter": part.diameter_m * 1e3}
-        info |= {f"min_{axis}": float(low[i]) for i, axis in enumerate("xyz")}
-        info |= {f"size_{axis}": float(size[i]) for i, axis in enumerate("xyz")}
+        info: dict[str, Any] = {"diameter": round(part.diameter_m * 1e3, 6)}
+        info |= {f"min_{axis}": round(float(low[i]), 6) for i, axis in enumerate("xyz")}
+        info |= {f"size_{axis}": round(float(size[i]), 6) for i, axis in enumerate("xyz")}
         info |= {key: value for key, value in symmetries_to_json(part.symmetries).items() if value}
         infos[str(part.obj_id)] = info
         keypoints[str(part.obj_id)] = {"name": part.name, "keypoints": (part.keypoints * 1e3).round(6).tolist()}
