@@ -217,17 +217,26 @@ def _build(
     config: StageConfig,
     board: TagboardConfig,
 ) -> mujoco.MjSpec:
+    """From the top down: geoms are drawn in this order, and what is hidden by then costs little."""
     spec = mujoco.MjSpec()
     spec.modelname = "stage"
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.02, 10.0
     spec.visual.map.shadowclip, spec.visual.quality.shadowsize = config.shadow_half_m, config.shadow_size
     spec.visual.headlight.diffuse = spec.visual.headlight.specular = [0.0] * 3
+    for k, part in enumerate(parts):
+        add_mesh(spec, f"{part.name}_visual", part.mesh)
+        for slot in range(k * config.slots, (k + 1) * config.slots):
+            _add_slot(spec, f"part_{slot:02d}", f"{part.name}_visual")
+    for name, mesh in distractor_meshes().items():
+        add_mesh(spec, name, mesh)
+        _add_slot(spec, name, name)
     body = spec.worldbody.add_body(name="board")
     add_board_visuals(spec, body, board)
     add_camera(body, BASLER, _above())
     add_material(spec, "surroundings", (0.3, 0.3, 0.31, 1.0), specular=0.0, shininess=0.1)
-    table = spec.worldbody.add_geom(name="surroundings", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.01])
+    beneath = spec.worldbody.add_body(name="surroundings")
+    table = beneath.add_geom(name="surroundings", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.01])
     table.pos, table.material, table.group = [0.0, 0.0, -board.thickness_m - 0.01], "surroundings", 1
     table.castshadow = False
     for k, texture in enumerate(textures):
@@ -236,13 +245,6 @@ def _build(
     for k, layer in enumerate(wear):
         assert clean is not None
         _add_matt(spec, f"tags_{k:02d}", worn(clean, layer))
-    for k, part in enumerate(parts):
-        add_mesh(spec, f"{part.name}_visual", part.mesh)
-        for slot in range(k * config.slots, (k + 1) * config.slots):
-            _add_slot(spec, f"part_{slot:02d}", f"{part.name}_visual")
-    for name, mesh in distractor_meshes().items():
-        add_mesh(spec, name, mesh)
-        _add_slot(spec, name, name)
     return spec
 
 
