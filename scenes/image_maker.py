@@ -24,8 +24,6 @@ from scenes.textures import make_textures, make_wear
 TEXTURES, ENVIRONMENTS, WORN_TAGS = 36, 12, 3
 STREAMS: dict[Split, int] = {"train": 101, "val": 202, "test": 303}
 """First word of every seed of a split: no two splits share a shot, a background or an environment."""
-FULL_MARGIN_PX = 160
-"""A part that reaches the border of a full-size crop may go on by at most its diameter: 10 mm are 150 px."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +110,7 @@ class ImageMaker:
 
 def stage_config(config: DatasetConfig) -> StageConfig:
     """Slots, window size and shadow map for the images of a data set."""
-    width, height = config.pixels
-    margin = 2 * int(np.ceil(FULL_MARGIN_PX / config.scale_down))
-    size = (width + margin, height + margin)
+    size = config.pixels
     slots = config.shot_ranges.most_parts(config.kind)
     if config.kind == "scene":
         return StageConfig(slots=slots, max_size=size, shadow_half_m=0.2, shadow_size=4096)
