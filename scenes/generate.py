@@ -23,6 +23,8 @@ from scenes.errors import SceneError
 from scenes.shards import SHARD, instances_in, shard_path, shard_problems
 from scenes.workers import Processes, Shard, ThisProcess, Workers
 
+AHEAD = 2
+"""Shards begun ahead for each that is under way, where it is not known how many it will take."""
 BARREN = 300
 """A part that none of the first BARREN images for each part of the set shows will not come."""
 
@@ -121,11 +123,14 @@ class Plan:
         """Images that count towards ``total``."""
         return min(sum(self._shard(index).count for index in self.counts), self.total)
 
-    def next(self) -> Shard | None:
-        """The next shard to make, None when no more is wanted."""
+    def next(self, ahead: int) -> Shard | None:
+        """The next shard to make, None when no more is wanted now.
+
+        While the end is not known, none is begun more than ``ahead`` after the first one that is missing.
+        """
         while self._asked in self.counts:
             self._asked += 1
-        if self._end is not None and self._asked >= self._end:
+        if self._asked >= (self._in_order + ahead if self._end is None else self._end):
             return None
         self._asked += 1
         return self._shard(self._asked - 1)
@@ -186,7 +191,7 @@ def _fill(
 
     with closing(_workers(config, split, jobs, ray, tell)) as workers:
         while not plan.complete:
-            while under_way < workers.slots and (shard := plan.next()) is not None:
+            while under_way < workers.slots and (shard := plan.next(AHEAD * workers.slots)) is not None:
                 workers.submit(shard)
                 under_way += 1
             for index in workers.finished():

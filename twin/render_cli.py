@@ -128,6 +128,8 @@ class DataValidate:
 
     folder: Positional[Path]
     """Folder of the data set."""
+    sample: int = 100
+    """Images whose pixels are compared with their labels; everything else is read completely."""
     json: FlagCreatePairsOff[bool] = False
     """Print as JSON."""
 
@@ -135,12 +137,11 @@ class DataValidate:
         """Print what is wrong, a line each; exit code 1 when anything is."""
         from scenes.validate import validate
 
-        problems = validate(self.folder)
-        if self.json:
-            print(json.dumps({"folder": str(self.folder), "problems": problems}, indent=1))
-        else:
-            print("\n".join(problems) or f"{self.folder}: nothing is wrong")
-        if problems:
+        if self.sample < 0:
+            raise SceneError(f"--sample {self.sample}: must not be negative")
+        report = validate(self.folder, sample=self.sample)
+        print(json.dumps(report.to_json(), indent=1) if self.json else report)
+        if not report.ok:
             sys.exit(1)
 
 

@@ -1,178 +1,242 @@
-"""Data sets on disk: labels that agree with the pixels, seeds that decide every byte, runs that can be interrupted."""
+"""Data sets come to the same bytes however they were made: at once, in pieces, longer later, by many workers."""
 
+import errno
 import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from painted import PaintedMaker
 
-from cad.parts import load_part, part_names
-from cad.spatial import BASLER, Intrinsics, apply, inverse
-from scenes.bop import T_from_bop
+from scenes.dataset_config import DatasetConfig
+from scenes.dataset_folder import GENERATOR, LOCK, opened
 from scenes.errors import SceneError
-from scenes.generate import DatasetConfig, generate
+from scenes.generate import Progress, generate
+from scenes.ranges import SensorRanges
+from scenes.workers import ThisProcess
 
-CROPS = DatasetConfig(kind="crop", split="val", count=24, chunk=12, seed=7)
-WINDOWS = DatasetConfig(kind="scene", split="train", count=6, chunk=6, seed=8, depth=True)
-PARTS = {load_part(name).obj_id: load_part(name) for name in part_names()}
+CONFIG = DatasetConfig(kind="crop", split="val", size=(32, 32), downscale=4, count=10, shard=4, seed=7)
 
 
-def quiet(_):
-    pass
+def changed(**changes):
+    """CONFIG with other settings."""
+    settings = {
+        name: getattr(CONFIG, name) for name in ("kind", "split", "size", "downscale", "count", "shard", "seed")
+    }
+    return DatasetConfig(**settings | changes)
 
 
 def files(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-@pytest.fixture(scope="module")
-def crops(tmp_path_factory):
-    out = tmp_path_factory.mktemp("crops") / "data"
-    generate(CROPS, out, quiet)
-    return out
+def rgb(folder, index, shard):
+    path = folder / "val" / f"{index // shard:06d}" / "rgb" / f"{index % shard:06d}.png"
+    return cv2.imread(str(path))
+
+
+@pytest.fixture(autouse=True)
+def painted(monkeypatch):
+    """Quick images; PaintedMaker.made is what was asked for."""
+    monkeypatch.setattr("scenes.workers.ImageMaker", PaintedMaker)
+    monkeypatch.setattr(PaintedMaker, "made", [])
 
 
 @pytest.fixture(scope="module")
-def windows(tmp_path_factory):
-    out = tmp_path_factory.mktemp("windows") / "data"
-    generate(WINDOWS, out, quiet)
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenes.workers.ImageMaker", PaintedMaker)
+        generate(CONFIG, out)
     return out
 
 
-def images(out):
-    """Every image as (rgb, intrinsics, T_cam_board, [(part, stable_pose, T_cam_part, mask, info)])."""
-    for chunk in sorted(p for p in out.glob("*/*") if p.name.isdigit()):
-        cameras, truths, infos = (
-            json.loads((chunk / f"{name}.json").read_text()) for name in ("scene_camera", "scene_gt", "scene_gt_info")
-        )
-        for i in sorted(cameras, key=int):
-            rgb = cv2.imread(str(chunk / "rgb" / f"{int(i):06d}.png"))[..., ::-1]
-            K = np.reshape(cameras[i]["cam_K"], (3, 3))
-            intrinsics = Intrinsics(
-                width=rgb.shape[1], height=rgb.shape[0], fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
-            )
-            seen = []
-            for k, (truth, info) in enumerate(zip(truths[i], infos[i], strict=True)):
-                mask = cv2.imread(str(chunk / "mask_visib" / f"{int(i):06d}_{k:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
-                T_cam_part = T_from_bop(truth["cam_R_m2c"], truth["cam_t_m2c"])
-                seen.append((PARTS[truth["obj_id"]], truth["stable_pose"], T_cam_part, mask, info))
-            yield rgb, intrinsics, T_from_bop(cameras[i]["cam_R_w2c"], cameras[i]["cam_t_w2c"]), seen
+def test_shards_hold_their_images_sums_and_labels(whole):
+    shards = sorted(p.name for p in (whole / "val").iterdir())
+    assert shards == ["000000", "000001", "000002"]
+    assert [len(list((whole / "val" / s / "rgb").iterdir())) for s in shards] == [4, 4, 2]
+    for shard in shards:
+        subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=whole / "val" / shard, check=True)
+        listed = [line.split("  ")[1] for line in (whole / "val" / shard / "SHA256SUMS").read_text().splitlines()]
+        there = {p.relative_to(whole / "val" / shard).as_posix() for p in (whole / "val" / shard).rglob("*.*")}
+        assert listed == sorted(listed) and set(listed) == there
+    assert not list(whole.rglob(".*"))
 
 
-def silhouette(part, intrinsics, T_cam_part, fine=16):
-    """The CAD model's filled outline, (H, W) bool, read at pixel centres."""
-    image = np.zeros((intrinsics.height * fine, intrinsics.width * fine), np.uint8)
-    pixels = intrinsics.project(apply(T_cam_part, part.mesh.vertices))
-    for triangle in np.round((pixels * fine + (fine - 1) / 2)[part.mesh.faces]).astype(np.int32):
-        cv2.fillConvexPoly(image, triangle, 1)
-    return image[fine // 2 :: fine, fine // 2 :: fine] > 0
+def test_the_manifest_counts_images_and_instances_that_are_seen(whole):
+    manifest = json.loads((whole / "manifest.json").read_text())
+    assert manifest["images"] == 10
+    assert manifest["instances"] == {"inserted": 8, "main": 4, "top": 1}  # too little of those in images 2 and 8
+    assert {name: entry["images"] for name, entry in manifest["shards"].items()} == {
+        "000000": 4,
+        "000001": 4,
+        "000002": 2,
+    }
 
 
-@pytest.mark.parametrize("which", ["crops", "windows"])
-def test_masks_are_the_projected_parts(which, request):
-    overlaps = []
-    for _, intrinsics, _, seen in images(request.getfixturevalue(which)):
-        for part, _, T_cam_part, mask, _ in seen:
-            truth = silhouette(part, intrinsics, T_cam_part)
-            if truth.sum() < 50:  # of a sliver at the border one pixel is a large share
-                continue
-            overlaps.append((mask & truth).sum() / (mask | truth).sum())
-    assert len(overlaps) > 10
-    assert np.mean(overlaps) > 0.98
-    assert min(overlaps) > 0.93  # a thin side of a part in a quarter-size window is 4 pixels wide
+def test_nothing_is_made_twice(whole):
+    before = files(whole)
+    generate(CONFIG, whole)
+    assert PaintedMaker.made == []
+    assert files(whole) == before
 
 
-def test_crops_are_128_pixels_round_a_part_or_hold_none(crops):
-    none = 0
-    for rgb, intrinsics, T_cam_board, seen in images(crops):
-        assert rgb.shape == (128, 128, 3)
-        np.testing.assert_allclose(intrinsics.fx, BASLER.fx / 2)
-        none += not seen
-        if seen:
-            part, stable_pose, T_cam_part, mask, _ = seen[0]
-            T_board_part = inverse(T_cam_board) @ T_cam_part
-            middle = (T_board_part @ inverse(part.stable_poses[stable_pose].T_table_part))[:3, 3]
-            centre = intrinsics.project(apply(T_cam_board, [middle[0], middle[1], 0.0]))
-            assert np.abs(centre - 63.5).max() < 12.5
-            assert mask.any()
-    assert 0 < none < CROPS.count / 2
+def test_a_run_that_is_stopped_keeps_whole_shards_and_goes_on_to_the_same_bytes(whole, tmp_path, monkeypatch):
+    out, make = tmp_path / "data", PaintedMaker.make
+
+    def stop(self, index):
+        if index == 6:
+            raise KeyboardInterrupt
+        return make(self, index)
+
+    monkeypatch.setattr(PaintedMaker, "make", stop)
+    with pytest.raises(KeyboardInterrupt):
+        generate(CONFIG, out)
+    assert [p.name for p in (out / "val").iterdir()] == ["000000"]
+    assert not (out / "manifest.json").exists()
+    monkeypatch.setattr(PaintedMaker, "make", make)
+    PaintedMaker.made.clear()
+    (out / "val" / ".000001.killed.partial" / "rgb").mkdir(parents=True)
+    told = []
+    generate(CONFIG, out, report=told.append)
+    assert PaintedMaker.made == [4, 5, 6, 7, 8, 9]
+    assert (told[-1].done, told[-1].total, told[-1].made) == (10, 10, 6)
+    assert [p.done for p in told] == sorted(p.done for p in told)
+    assert files(out) == files(whole)
 
 
-def test_parts_rest_on_the_face_that_the_label_names(crops):
-    for _, _, T_cam_board, seen in images(crops):
-        for part, stable_pose, T_cam_part, _, _ in seen:
-            T_board_part = inverse(T_cam_board) @ T_cam_part
-            up = part.stable_poses[stable_pose].R_table_part[2]
-            assert np.degrees(np.arccos(min(1.0, up @ T_board_part[2, :3]))) < 0.31
-            assert abs(apply(T_board_part, part.mesh.vertices)[:, 2].min()) < 1e-4
+def test_a_data_set_may_be_made_longer(whole, tmp_path):
+    short, out = changed(count=6), tmp_path / "data"
+    generate(short, out)
+    with pytest.raises(SceneError, match=r"count 6, not 5; a data set can grow but not shrink"):
+        generate(changed(count=5), out)
+    PaintedMaker.made.clear()
+    generate(CONFIG, out)
+    assert PaintedMaker.made == [4, 5, 6, 7, 8, 9]  # the last shard was short
+    assert files(out) == files(whole)
 
 
-def test_counts_and_boxes_tell_whole_from_cut_parts(windows):
-    for rgb, _, _, seen in images(windows):
-        assert rgb.shape == (320, 320, 3)
-        for _, _, _, mask, info in seen:
-            x, y, w, h = info["bbox_obj"]
-            cut = x < 0 or y < 0 or x + w > 320 or y + h > 320
-            assert info["px_count_visib"] == mask.sum()
-            assert (info["visib_fract"] < 1) == cut
+def test_an_image_does_not_depend_on_the_size_of_the_shards(whole, tmp_path):
+    generate(changed(shard=3), tmp_path / "data")
+    for index in range(10):
+        np.testing.assert_array_equal(rgb(tmp_path / "data", index, 3), rgb(whole, index, 4))
 
 
-def test_depth_is_the_distance_of_the_board(windows):
-    chunk = windows / "train" / "000000"
-    scale = json.loads((chunk / "scene_camera.json").read_text())["0"]["depth_scale"]
-    depth_mm = cv2.imread(str(chunk / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED) * scale
-    assert 680 < np.median(depth_mm) < 720
+class OutOfOrder(ThisProcess):
+    """Has several shards under way and completes the last one first."""
+
+    slots = 3
+
+    def finished(self):
+        self._waiting.reverse()
+        return super().finished()
 
 
-def test_models_are_written_in_millimetres(crops):
-    infos = json.loads((crops / "models" / "models_info.json").read_text())
-    for obj_id, part in PARTS.items():
-        assert (crops / "models" / f"obj_{obj_id:06d}.ply").exists()
-        np.testing.assert_allclose(infos[str(obj_id)]["diameter"], part.diameter_m * 1e3)
-
-
-def test_an_interrupted_run_leaves_whole_chunks_and_goes_on_to_the_same_bytes(crops, tmp_path):
-    class StopError(Exception):
-        pass
-
-    def stop(_):
-        raise StopError
-
+@pytest.mark.parametrize("make_workers", [ThisProcess, OutOfOrder])
+def test_a_data_set_ends_with_the_first_shard_that_fulfils_it(tmp_path, monkeypatch, make_workers):
+    monkeypatch.setattr("scenes.generate._workers", lambda config, split, *_: make_workers(config, split, lambda: None))
     out = tmp_path / "data"
-    with pytest.raises(StopError):
-        generate(CROPS, out, stop)
-    (out / "val" / ".000001.partial" / "rgb").mkdir(parents=True)
-    assert [p.name for p in (out / "val").iterdir() if p.name.isdigit()] == ["000000"]
-    lines = []
-    generate(CROPS, out, lines.append)
-    assert "24 of 24 images" in lines[-1]
-    assert files(out) == files(crops)
-    generate(CROPS, out, stop)  # nothing is missing, nothing is reported
+    manifest = generate(changed(count=None, instances=2), out)
+    assert manifest["instances"] == {"inserted": 10, "main": 6, "top": 2}  # image 11 shows the second top
+    assert manifest["images"] == 12 == len(list(out.glob("val/*/rgb/*")))
+    PaintedMaker.made.clear()
+    assert generate(changed(count=None, instances=2), out) == manifest
+    assert PaintedMaker.made == []
+    assert generate(changed(count=None, instances=3), out)["images"] == 20  # image 17 shows the third
 
 
-def test_the_number_of_workers_does_not_change_a_byte(crops, tmp_path):
-    many = DatasetConfig(kind="crop", split="val", count=24, chunk=12, seed=7, jobs=2)
-    generate(many, tmp_path / "data", quiet)
-    assert files(tmp_path / "data") == files(crops)
-
-
-def test_a_folder_with_other_data_is_refused(crops, tmp_path):
-    with pytest.raises(SceneError, match="made with other settings"):
-        generate(DatasetConfig(kind="crop", split="val", count=24, chunk=12, seed=9), crops, quiet)
-    (tmp_path / "letter.txt").write_text("mine")
-    with pytest.raises(SceneError, match="is not empty"):
-        generate(CROPS, tmp_path, quiet)
+def test_a_part_that_never_shows_ends_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(PaintedMaker, "absent", ("top",))
+    monkeypatch.setattr("scenes.generate.BARREN", 4)
+    with pytest.raises(SceneError, match="none of the first 12 images shows top"):
+        generate(changed(count=None, instances=2), tmp_path / "data")
+    assert PaintedMaker.made == list(range(12))
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("changes", "told"),
     [
-        ({"kind": "movie"}, "is not one of crop, fine, scene"),
-        ({"split": "test"}, "is not one of train, val"),
-        ({"count": 0}, "count 0"),
-        ({"chunk": 2000}, "at most 1000"),
+        ({"seed": 9}, "seed 7, not 9"),
+        ({"jpeg": 90}, "jpeg none, not 90"),
+        ({"count": None, "instances": 5}, "count 10, not none; instances none, not 5"),
+        ({"parts": ("main",)}, r"parts.inserted.mesh \w+, not none"),
+        ({"sensor": SensorRanges(gradient=0.0)}, "sensor.gradient 0.1, not 0.0"),
     ],
 )
-def test_wrong_settings_are_refused(settings, says):
-    with pytest.raises(SceneError, match=says):
-        DatasetConfig(**settings)
+def test_other_settings_are_named_with_both_values(whole, changes, told):
+    with pytest.raises(SceneError, match=f"holds another data set, made with {told}.*choose another|{told}.*--out"):
+        generate(changed(**changes), whole)
+
+
+def test_another_version_of_the_generator_is_refused(whole, monkeypatch):
+    monkeypatch.setattr("scenes.dataset_folder.GENERATOR", GENERATOR + 1)
+    with pytest.raises(SceneError, match=f"generator {GENERATOR}, not {GENERATOR + 1}"):
+        generate(CONFIG, whole)
+
+
+def test_a_folder_with_other_things_in_it_is_refused(tmp_path):
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(SceneError, match=r"is not empty and holds no dataset\.json"):
+        generate(CONFIG, tmp_path)
+    with pytest.raises(SceneError, match="is a file"):
+        generate(CONFIG, tmp_path / "letter.txt")
+    assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_two_runs_do_not_write_into_one_folder(whole):
+    with opened(CONFIG, whole), pytest.raises(SceneError, match=rf"process {os.getpid()} on .* writes into"):
+        generate(CONFIG, whole)
+    assert not (whole / LOCK).exists()
+    (whole / LOCK).write_text("process 1 on elsewhere\n")  # left by one that was killed
+    generate(CONFIG, whole)
+
+
+def test_a_full_disk_leaves_nothing_half_written_under_a_final_name(whole, tmp_path, monkeypatch):
+    out, write = tmp_path / "data", Path.write_bytes
+
+    def full(self, content):
+        if self.name == "000002.png" and self.parent.parent.name.startswith(".000001"):
+            write(self, content[:10])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
+        return write(self, content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(
+        SceneError, match=r"(?s)No space left on device.*000002\.png.*1 of 3 shards are finished and kept"
+    ):
+        generate(CONFIG, out)
+    assert [p.name for p in (out / "val").iterdir()] == ["000000"]
+    monkeypatch.setattr(Path, "write_bytes", write)
+    generate(CONFIG, out)
+    assert files(out) == files(whole)
+
+
+def test_damage_is_found_and_mended(whole, tmp_path):
+    out = tmp_path / "data"
+    shutil.copytree(whole, out)
+    damaged = out / "val" / "000001"
+    (damaged / "rgb" / "000000.png").write_bytes(b"rubbish")
+    (damaged / "depth" / "000003.png").unlink()
+    with pytest.raises(SceneError) as found:
+        generate(CONFIG, out, verify=True)
+    assert "rgb/000000.png was changed" in str(found.value) and "depth/000003.png is missing" in str(found.value)
+    assert f"delete {damaged}" in str(found.value)
+    shutil.rmtree(damaged)
+    generate(CONFIG, out, verify=True)
+    assert files(out) == files(whole)
+
+
+def test_the_time_left_follows_from_this_runs_rate():
+    progress = Progress(done=150, total=250, made=50, seconds=10.0)
+    assert (progress.rate, progress.seconds_left) == (5.0, 20.0)
+    assert Progress(done=100, total=250, made=0, seconds=3.0).seconds_left is None
+
+
+def test_less_than_one_worker_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="jobs 0"):
+        generate(CONFIG, tmp_path / "data", jobs=0)
+    assert not (tmp_path / "data").exists()
