@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from scenes.environments import CAMERA_HALF_DEG, FACES, KINDS, directions, irradiance, make_environments
+from scenes.gl import mujoco
+from scenes.scene_export import environment_panorama
 
 COUNT = 2 * len(KINDS)
 
@@ -85,3 +87,16 @@ def test_the_bench_below_is_even(cubes):
     below = directions(64)[..., 2] < -0.2
     for cube in cubes:
         assert np.ptp(cube[below], axis=0).max() <= 1
+
+
+def test_a_cube_map_stands_in_the_world_as_its_faces_say():
+    """Each pixel holds its direction: so does the panorama that MuJoCo's texture of it stands for."""
+    cube = np.rint(127.5 + 127.5 * directions(32)).astype(np.uint8)
+    spec = mujoco.MjSpec()
+    texture = spec.add_texture(name="environment_00", type=mujoco.mjtTexture.mjTEXTURE_CUBE)
+    texture.height, texture.width, texture.nchannel = 6 * 32, 32, 3
+    texture.data = cube.tobytes()
+    panorama = environment_panorama(spec.compile(), 0) * 2 - 1
+    zenith, nadir, north, east = panorama[0, 64], panorama[-1, 64], panorama[32, 64], panorama[32, 96]
+    for seen, expected in ((zenith, (0, 0, 1)), (nadir, (0, 0, -1)), (north, (0, 1, 0)), (east, (1, 0, 0))):
+        np.testing.assert_allclose(seen, expected, atol=0.06)

@@ -1,5 +1,6 @@
 """The sensor against EMVA 1288 and against what it must leave alone."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -169,6 +170,16 @@ def test_the_same_generator_gives_the_same_image():
         a, b, c = (expose(image, sensor, np.random.default_rng(seed)) for seed in (1, 1, 2))
         np.testing.assert_array_equal(a, b)
         assert (a != c).any()
+
+
+def test_the_default_sensor_is_what_the_pick_cell_was_tuned_on():
+    """Blur of 0.6 pixels, then noise of variance 0.25 + 0.017 for each grey level from the generator's own normals."""
+    image = np.random.default_rng(0).integers(0, 256, (97, 113, 3), dtype=np.uint8)
+    ideal = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.6, borderType=cv2.BORDER_REFLECT_101)
+    ideal = np.clip(ideal, 0, 255)
+    noise = np.random.default_rng(7).standard_normal(image.shape, dtype=np.float32)
+    expected = np.rint(np.clip(ideal + noise * np.sqrt(0.25 + 0.017 * ideal), 0, 255))
+    np.testing.assert_array_equal(expose(image, SensorConfig(), np.random.default_rng(7)), expected)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
