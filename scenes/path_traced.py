@@ -190,6 +190,7 @@ class MitsubaRenderer:
             "base_color": colour,
             "metallic": finish.metallic,
             "roughness": max(finish.roughness, SMOOTHEST),
+            "main_specular_sampling_rate": 0.1 + 0.9 * finish.metallic,
         }
         return self._mi.load_dict({"type": "twosided", "surface": surface})
 
