@@ -19,8 +19,9 @@ WHITE = np.pi * 1.2 * 2**15 / HEADROOM
 100) saturates at 1.2 * 2**15 candela a square metre."""
 SCALE = 20.0
 """Filament's units a metre. It keeps shadows a thousandth of a unit away from what casts them."""
-DIRECTIONAL_DISTANCE = 1.0 * SCALE
-RANGE = 10.0 * SCALE
+RANGE = 100.0 * SCALE
+DIRECTIONAL_DISTANCE, DIRECTIONAL_CONE_DEG = 10.0 * SCALE, 60.0
+"""A directional lamp without shadows is a spot so far away and so wide: Filament has one directional light only."""
 SHADOW_COARSENING = 2
 """Shadow maps are this much coarser than the classic renderer's: Filament smooths their borders over a texel, which
 should be about a pixel as there is one sample of a shadow a pixel."""
@@ -35,6 +36,8 @@ SETTINGS = """<mujoco><custom>
   <text name="filament.shadows.type" data="pcf"/>
 </custom></mujoco>"""
 _GEOM = mujoco.mjtObj.mjOBJ_GEOM
+Surround = int | tuple[int, int, int]
+"""What light from all around has: an environment, which is a texture of the model, or a plain colour, 0 to 255."""
 
 
 class FilamentScene:
@@ -56,8 +59,8 @@ class FilamentScene:
         self._sun = context.create_light(mjrf.LightParams(type=mjrf.LightType.LIGHT_DIRECTIONAL))
         self.scene.add_light(self._sun)
         self._lamps: dict[str, mjrf.Light] = {}
-        self._cubes: dict[object, mjrf.Texture] = {}
-        self._surround: tuple[object, mjrf.Light] | None = None
+        self._surrounds: dict[Surround, tuple[mjrf.Texture, mjrf.Light]] = {}
+        self._surround: Surround | None = None
 
     def update(self, data: mujoco.MjData) -> None:
         """Make the scene what the model and its forwarded data say now."""
@@ -132,17 +135,15 @@ class FilamentScene:
 
     def _aim(self, light: mjrf.Light, lamp: DrawnLamp) -> None:
         """A lamp without shadows. Directional light comes from a spot some way from the middle of the scene."""
-        model = self._model
-        position, strength, cutoff = SCALE * lamp.position, SCALE**2, lamp.cutoff
+        position, strength, cutoff_deg = SCALE * lamp.position, SCALE**2, np.degrees(lamp.cutoff)
         if lamp.kind == "directional":
             position = SCALE * self._aimed_at(lamp) - DIRECTIONAL_DISTANCE * lamp.direction
-            strength = DIRECTIONAL_DISTANCE**2
-            cutoff = np.arctan(2 * SCALE * model.vis.map.shadowclip * model.stat.extent / DIRECTIONAL_DISTANCE)
+            strength, cutoff_deg = DIRECTIONAL_DISTANCE**2, DIRECTIONAL_CONE_DEG
         brightest = max(*lamp.rgb, 1e-9)
         light.set_pose(position.astype(np.float32), lamp.direction.astype(np.float32))
         light.set_color((np.array(lamp.rgb) / brightest).astype(np.float32))
         light.set_intensity(brightest * strength * WHITE)
-        light.set_cutoff(np.degrees(cutoff))
+        light.set_cutoff(cutoff_deg)
 
     def _aimed_at(self, lamp: DrawnLamp) -> Array:
         """The point on a lamp's axis that is nearest to the middle of the scene, which is ``stat.center``."""
@@ -151,28 +152,27 @@ class FilamentScene:
     def _surround_with(self, description: SceneDescription) -> None:
         """Light from all around: the model's environment, else a uniform one of the headlight's ambient colour."""
         brightest = max(description.ambient)
-        wanted: object = description.environment
+        wanted: Surround = description.environment
         if description.environment < 0:
-            wanted = tuple(np.rint(255 * np.array(description.ambient) / max(brightest, 1e-9)).astype(np.uint8))
-        if self._surround is None or self._surround[0] != wanted:
+            red, green, blue = (round(255 * level / max(brightest, 1e-9)) for level in description.ambient)
+            wanted = red, green, blue
+        if wanted != self._surround:
             if self._surround is not None:
-                self.scene.remove_light(self._surround[1])
-            self._surround = wanted, self._image_light(wanted)
-            self.scene.add_light(self._surround[1])
+                self.scene.remove_light(self._surrounds[self._surround][1])
+            if wanted not in self._surrounds:
+                self._surrounds[wanted] = self._image_light(wanted)
+            self.scene.add_light(self._surrounds[wanted][1])
+            self._surround = wanted
         radiance = description.environment_radiance if description.environment >= 0 else brightest
-        self._surround[1].set_intensity(radiance * WHITE / np.pi)
+        self._surrounds[wanted][1].set_intensity(radiance * WHITE / np.pi)
 
-    def _image_light(self, wanted: object) -> mjrf.Light:
-        """An image light from a texture of the model or of a plain colour (3,) uint8."""
-        if wanted not in self._cubes:
-            if isinstance(wanted, int):
-                faces = np.rint(255 * texture_image(self._model, wanted)).astype(np.uint8)
-            else:
-                faces = np.broadcast_to(np.array(wanted, np.uint8), (6 * PLAIN_FACE, PLAIN_FACE, 3))
-            self._cubes[wanted] = self._upload(faces, mjrf.SamplerType.TEXTURE_CUBE)
-        return self._context.create_light(
-            mjrf.LightParams(type=mjrf.LightType.LIGHT_IMAGE, texture=self._cubes[wanted], intensity=1.0)
-        )
+    def _image_light(self, wanted: Surround) -> tuple[mjrf.Texture, mjrf.Light]:
+        if isinstance(wanted, int):
+            faces = np.rint(255 * texture_image(self._model, wanted)).astype(np.uint8)
+        else:
+            faces = np.broadcast_to(np.array(wanted, np.uint8), (6 * PLAIN_FACE, PLAIN_FACE, 3))
+        cube = self._upload(faces, mjrf.SamplerType.TEXTURE_CUBE)
+        return cube, self._context.create_light(mjrf.LightParams(type=mjrf.LightType.LIGHT_IMAGE, texture=cube))
 
     def _texture(self, index: int) -> mjrf.Texture:
         if index not in self._textures:
