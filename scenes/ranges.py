@@ -162,13 +162,13 @@ TRAIN_LOOK = LookRanges()
 TEST_LOOK = LookRanges(
     default_look=0.0,
     lamps=(1, 2),
-    lamp_elevation_deg=(20.0, 33.0),
+    lamp_elevation_deg=(25.0, 34.0),
     lamp_total=(0.55, 1.0),
-    lamp_tint=0.12,
-    ambient=(0.05, 0.11),
+    lamp_tint=0.08,
+    ambient=(0.07, 0.115),
     texture_share=0.9,
     texture_repeat=(10.0, 14.0),
-    board_tint=0.12,
+    board_tint=0.08,
     surroundings_level=(0.02, 0.09),
 )
 """Flatter, more coloured light over less of it from around; finer, more coloured backgrounds."""

@@ -21,6 +21,8 @@ from scenes.errors import SceneError
 Levels = NDArray[np.float32]
 RAW_MAX = 4095
 """Largest value of the 12 bit converter."""
+BAND = 1 << 18
+"""Values that are read at once: as many as stay in a core's cache."""
 NOTHING = np.zeros(4)
 SHARP_PX = 0.15
 """A blur of smaller sigma changes nothing."""
@@ -107,6 +109,17 @@ def expose(
         np.clip(levels, 0, 255, out=levels)
     if sensor.bayer and downscale == 1:
         return _tone(_mosaic(levels, sensor, rng, phase, noisy), sensor.gamma)
+    out = np.empty(levels.shape, np.uint8)
+    rows = max(1, BAND // levels[0].size)
+    for top in range(0, len(out), rows):
+        out[top : top + rows] = _read(levels[top : top + rows], sensor, rng, downscale, noisy)
+    return out
+
+
+def _read(
+    levels: Levels, sensor: SensorConfig, rng: np.random.Generator, downscale: float, noisy: bool
+) -> NDArray[np.uint8]:
+    """Noise, colour gains, gamma and 8 bits of some rows of an image, which are changed."""
     if noisy:
         noise = _deviates(levels.shape, sensor, rng)
         noise *= _deviation(levels, sensor, downscale)
@@ -143,7 +156,7 @@ def _deviates(shape: tuple[int, ...], sensor: SensorConfig, rng: np.random.Gener
         return rng.standard_normal(shape, dtype=np.float32)
     count = int(np.prod(shape))
     words = rng.integers(0, 2**64, -(-count // 4), dtype=np.uint64)
-    return _quantiles()[words.view(np.uint16)[:count]].reshape(shape)
+    return np.take(_quantiles(), words.view(np.uint16)[:count]).reshape(shape)
 
 
 @cache
@@ -191,4 +204,4 @@ def _converted(levels: Levels) -> NDArray[np.uint16]:
 def _tone(values: NDArray[np.uint16], gamma: float) -> NDArray[np.uint8]:
     """12 bit values to 8 bits through the camera's gamma."""
     curve = np.rint(255 * (np.arange(RAW_MAX + 1) / RAW_MAX) ** gamma).astype(np.uint8)
-    return curve[values]
+    return np.take(curve, values)
