@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import resource
 import tempfile
@@ -92,6 +93,7 @@ def _work(config: DatasetConfig, split: Path, k: int, workers: int, seconds: flo
     assert _barrier is not None
     use_one_core(config.domain)
     maker = ShardMaker(config, split)
+    gc.freeze()
     try:
         maker.make(Shard(index=k, first=k, count=1), lambda: None)
         start_s = time.time() - born

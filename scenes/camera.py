@@ -46,7 +46,7 @@ def set_camera_pose(model: mujoco.MjModel, data: mujoco.MjData, T_body_cam: Arra
     i = model.camera(name).id
     T_body_camgl = T_body_cam @ CAM_FROM_CAMGL
     model.cam_pos[i] = T_body_camgl[:3, 3]
-    model.cam_quat[i] = quat_wxyz_from_rotation(T_body_camgl[:3, :3])
+    mujoco.mju_mat2Quat(model.cam_quat[i], T_body_camgl[:3, :3].ravel())
     body = model.cam_bodyid[i]
     T_world_camgl = transform(data.xmat[body].reshape(3, 3), data.xpos[body]) @ T_body_camgl
     data.cam_xpos[i], data.cam_xmat[i] = T_world_camgl[:3, 3], T_world_camgl[:3, :3].ravel()

@@ -1,7 +1,7 @@
 """PNG files, with the settings that suit what is in them: fast to write, and smaller than with the usual ones.
 
-Noise of a sensor leaves nothing to find for a search of repeated strings, so colour images only have the difference to
-their neighbours coded; masks are runs; depth repeats from row to row. Measured in docs/render_speed.md.
+Noise of a sensor leaves nothing to find for a search of repeated strings, so of colours only the difference to their
+neighbours is coded; masks are runs; depth repeats from row to row. Measured in docs/render_speed.md.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LEVEL = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_VALUES = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 _RUNS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _STRINGS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
-_COLOUR = (*_LEVEL, *_RUNS, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG)
+_COLOUR = (*_LEVEL, *_VALUES, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG)
 _MASK = (*_LEVEL, *_RUNS, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)
-_DEPTH = (*_LEVEL, *_STRINGS, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
+_DEPTH = (*_LEVEL, *_STRINGS, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)
 
 
 def encode_png(image: NDArray[Any]) -> bytes:

@@ -6,6 +6,7 @@ Each worker keeps one core busy: the software rasteriser, OpenCV, BLAS and Dr.Ji
 from __future__ import annotations
 
 import contextlib
+import gc
 import multiprocessing
 import os
 import signal
@@ -253,5 +254,7 @@ def _make(shard: Shard) -> None:
 
     if stop.value:
         return
-    _maker = _maker or ShardMaker(config, split)
+    if _maker is None:
+        _maker = ShardMaker(config, split)
+        gc.freeze()  # what lasts is not looked through again and again
     _maker.make(shard, tick)
