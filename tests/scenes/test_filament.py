@@ -62,7 +62,7 @@ def plate_model():
     box.unmerge_vertices()
     add_raw_mesh(spec, "part", box.vertices, box.faces, normals=np.repeat(box.face_normals, 3, axis=0))
     add_visual(part, "part_00_visual", "part", material="metal").pos = [0.0, 0.0, 0.002]
-    for i, towards in enumerate(([0.0, 0.6, 0.8], [0.0, 0.0, 1.0])):
+    for i, towards in enumerate(([0.0, 0.6, 0.8], [0.28, 0.0, 0.96])):
         light = spec.worldbody.add_light(name=f"lamp_{i}", type=mujoco.mjtLightType.mjLIGHT_SPOT, cutoff=10.0)
         light.pos, light.dir, light.diffuse = 0.5 * np.array(towards), -np.array(towards), [0.3] * 3
         light.intensity, light.castshadow = WHITE_LUX * 0.25, i == 0
@@ -201,7 +201,7 @@ def test_lamps_add_what_their_strength_says_and_may_exceed_saturation(plate):
     model.vis.headlight.ambient[:] = 0.0
     model.light_active[0] = 0
     one = plate.level()
-    assert one == pytest.approx(255 * 0.3 * 0.8, rel=0.06)
+    assert one == pytest.approx(255 * 0.3 * 0.96 * 0.8, rel=0.06)
     model.light_intensity[1] *= 2
     assert plate.level() == pytest.approx(2 * one, abs=2)
     model.light_diffuse[1] = [0.7, 0.3, 0.0]
