@@ -21,6 +21,8 @@ from scenes.errors import SceneError
 Levels = NDArray[np.float32]
 RAW_MAX = 4095
 """Largest value of the 12 bit converter."""
+GLINT = 1.5 * 255
+"""Metal that mirrors a lamp exceeds this level: nobody sets the exposure by it."""
 BAND = 1 << 18
 """Values that are read at once: as many as stay in a core's cache."""
 NOTHING = np.zeros(4)
@@ -78,10 +80,10 @@ def mosaic_phase(intrinsics: Intrinsics) -> tuple[int, int]:
 
 
 def brightest(image: NDArray[np.uint8] | Levels) -> float:
-    """The grey level that a fiftieth of an image (H, W, 3) exceeds: what exposure is set by."""
+    """The grey level that a fiftieth of an image (H, W, 3) exceeds, at most GLINT: what exposure is set by."""
     sample = np.ravel(image[::4, ::4])
     k = int(0.98 * (sample.size - 1))
-    return float(np.partition(sample, k)[k])
+    return min(float(np.partition(sample, k)[k]), GLINT)
 
 
 def expose(

@@ -8,7 +8,7 @@ from cad.spatial import BASLER
 from scenes.errors import SceneError
 from scenes.randomize import draw_sensor
 from scenes.ranges import SensorRanges
-from scenes.sensor import SensorConfig, brightest, expose, mosaic_phase, noise_levels
+from scenes.sensor import GLINT, SensorConfig, brightest, expose, mosaic_phase, noise_levels
 
 SILENT = {"blur_px": 0.0, "shot_noise": 0.0, "read_noise": 0.0}
 
@@ -195,6 +195,8 @@ def test_the_brightest_fiftieth_sets_the_exposure():
     image[:60, :60] = 180.0
     level = brightest(image)
     assert level == 180.0
+    image[:60, :60] = 5000.0
+    assert brightest(image) == GLINT
     sensor = draw_sensor(SensorRanges(highlight=(240.0, 240.0), gradient=0.0), level, np.random.default_rng(0))
     assert sensor.exposure * 180 == pytest.approx(240)
 
