@@ -35,7 +35,7 @@ SAMPLES = 64
 MAX_DEPTH = 6
 GROUPS = 8
 STRIDE = 1_000_003
-SPECK_FACTOR, SPECK_LEVEL = 1.5, 0.1
+SPECK_FACTOR, SPECK_LEVEL = 1.5, 0.05
 SAMPLES_AT_ONCE = 1 << 24
 """Larger windows are drawn in bands of rows, which bounds the memory that a render takes."""
 SCENE = {"type": "scene", "embree_use_robust_intersections": True}
