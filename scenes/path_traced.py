@@ -54,9 +54,10 @@ NO_LAMP_RADIUS_M = 1e-6
 class MitsubaRenderer:
     """Path tracing with ``samples`` a pixel (a power of 4 spreads them best) and a box filter, linear and not clipped.
 
-    Instances and depth are of pixel centres. The noise is drawn from ``seed`` and from what is rendered, so the same
-    scene through the same window gives the same bytes and another scene other noise. All surfaces cast shadows. Lamps
-    shine in all directions and are seen in reflections only, never by the camera; what no geom covers is black.
+    Instances and depth are of pixel centres. The noise is drawn from ``seed`` and from what is rendered: the same
+    scene through the same window gives the same bytes, by any number of threads, and another scene other noise; so do
+    Mitsuba's two variants, and may processors of other kinds. All surfaces cast shadows. Lamps shine in all directions
+    and are seen in reflections only, never by the camera; what no geom covers is black.
     """
 
     def __init__(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from importlib import metadata
 
+from scenes.photoreal import mitsuba_hint
 from twin.robot import TwinError
 
 GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
@@ -72,9 +73,11 @@ def doctor(fix: bool = False) -> dict[str, str]:
             problems["filament"] = domain_state("filament")
         except TwinError as error:
             print(f"left out: {error}", file=sys.stderr)
+    hint = " ".join(mitsuba_hint().split())
     return (
         versions()
         | {f"{domain} rendering": " ".join(problem.split()) or "works" for domain, problem in problems.items()}
+        | ({"hint": hint} if hint else {})
         | {"cores": str(os.cpu_count())}
     )
 
