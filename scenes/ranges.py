@@ -118,7 +118,8 @@ class SensorRanges(_Ranges):
     """Focus, exposure, colour balance and the noise of the sensor, in the terms of EMVA 1288.
 
     The camera's IMX183 saturates at 15,000 electrons (12 bits of 3.66 electrons: ZWO's ASI183, quoted in AAVSO's forum)
-    or 16,100 (42.08 dB signal to noise at saturation: Daheng's MER2-2000-19U3M, va-imaging.com).
+    or 16,100 (42.08 dB signal to noise at saturation: Daheng's MER2-2000-19U3M, va-imaging.com). Its quantum efficiency
+    is part of the exposure: noise depends on the electrons that are there.
     """
 
     highlight: Annotated[Range, Within(20, 1000)] = (110.0, 252.0)
