@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import sys
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import ExitStack, redirect_stdout, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ RETRIES = 3
 """How often Ray does a shard again whose worker died."""
 AHEAD = 2
 """Tasks asked for per core of the cluster, so that none waits for the next one."""
+LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Where it is 0 when Ray is imported, a local Ray listens on 127.0.0.1 only, on every system."""
 OBJECT_STORE_BYTES = 100_000_000
 """Of a local Ray: images do not go through the object store."""
 SHOWS_WITHIN_S = 60.0
@@ -40,7 +43,10 @@ class RayWorkers:
     """
 
     def __init__(self, config: DatasetConfig, split: Path, address: str, jobs: int) -> None:
-        self._ray, self._folder = _connect(address, jobs)
+        with ExitStack() as stack:
+            stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints what went wrong; it is no result
+            self._ray = _connect(address, jobs, stack)
+            self._stack = stack.pop_all()
         self._split, self._address, self._made = split.resolve(), address, 0
         self._ledger = self._ray.remote(num_cpus=0, max_restarts=-1)(Ledger).remote()
         remote = self._ray.remote(num_cpus=1, max_retries=RETRIES, retry_exceptions=False)
@@ -84,13 +90,9 @@ class RayWorkers:
 
     def close(self) -> None:
         """See :class:`scenes.workers.Workers`. Tasks under way are killed; a Ray that was started for this ends."""
-        try:
+        with self._stack:
             for task in self._pending:
                 self._ray.cancel(task, force=True)
-        finally:
-            self._ray.shutdown()
-            if self._folder is not None:
-                shutil.rmtree(self._folder, ignore_errors=True)
 
     def _await_shard(self, index: int, host: str) -> None:
         """Raise SceneError when what a worker has written does not show here."""
@@ -158,30 +160,26 @@ def _check_machine(config: DatasetConfig, split: Path, wanted: dict[str, Any], h
         )
 
 
-def _connect(address: str, jobs: int) -> tuple[Any, Path | None]:
-    """Ray, connected, and the folder of its logs where it was started for this."""
+def _connect(address: str, jobs: int, stack: ExitStack) -> Any:
+    """Ray, connected; ``stack`` ends it, and removes the logs of one that was started for this."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address == LOCAL:
+        os.environ.setdefault(LOOPBACK, "0")
     try:
         import ray
     except ImportError as error:
         raise SceneError("--ray needs Ray; run: pip install 'tagcell[ray]'") from error
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address == LOCAL:
+        folder = tempfile.mkdtemp(prefix="ray-")
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        settings |= {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+        settings |= {"_node_ip_address": "127.0.0.1", "_temp_dir": folder}
+    stack.callback(ray.shutdown)
     try:
-        if address != LOCAL:
-            ray.init(address, **quiet)
-            return ray, None
-        folder = Path(tempfile.mkdtemp(prefix="ray-"))
-        ray.init(
-            address=LOCAL,
-            num_cpus=jobs,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            _node_ip_address="127.0.0.1",
-            _temp_dir=str(folder),
-            **quiet,
-        )
-        return ray, folder
+        ray.init(address, **settings)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         raise SceneError(
             f"no Ray cluster at {address!r}: {error}; start one (ray start --head), or use --ray {LOCAL}"
         ) from error
+    return ray

@@ -25,7 +25,7 @@ from scenes.bop import write_camera, write_models
 from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
 from scenes.rests import RestPool
-from scenes.shards import PARTIAL, images_in, shard_digest, shard_path
+from scenes.shards import clear_partial, images_in, shard_digest, shard_path
 
 GENERATOR = 1
 """Raise it with every change of the code that changes the bytes of any data set."""
@@ -52,8 +52,10 @@ def identity(config: DatasetConfig) -> dict[str, Any]:
 
 def differences(there: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
     """The fields in which two identities differ, with both values; nested fields are joined by dots."""
+    if list(there.get("parts", {})) != list(wanted["parts"]):  # their names say it
+        there, wanted = ({**content, "parts": ", ".join(content.get("parts", {}))} for content in (there, wanted))
     old, new = _flat(there), _flat(wanted)
-    names = [name for name in (*new, *(old.keys() - new.keys())) if old.get(name) != new.get(name)]
+    names = [name for name in {**new, **old} if old.get(name) != new.get(name)]
     return [f"{name} {_short(old.get(name))}, not {_short(new.get(name))}" for name in names]
 
 
@@ -156,8 +158,7 @@ def _prepare(config: DatasetConfig, wanted: dict[str, Any], out: Path) -> Path:
         _write_models(config, out)
     RestPool.load_or_make(config.load_parts(), out)
     split.mkdir(exist_ok=True)
-    for leftover in split.glob(PARTIAL):
-        shutil.rmtree(leftover)
+    clear_partial(split)
     return split
 
 
@@ -180,7 +181,7 @@ def _compare(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
     shown, more = differing[:SHOWN_DIFFERENCES], len(differing) - SHOWN_DIFFERENCES
     if more > 0:
         shown.append(f"and {more} more")
-    if any(difference.startswith(GOALS) for difference in differing):
+    if any(there.get(name) and wanted[name] and there[name] > wanted[name] for name in GOALS):
         shown.append("a data set can grow but not shrink")
     raise SceneError(
         f"{out} holds another data set, made with {'; '.join(shown)}. Choose another folder with --out, or go on with "

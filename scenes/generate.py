@@ -20,7 +20,7 @@ from scenes.dataset_config import DatasetConfig
 from scenes.dataset_folder import opened, write_manifest
 from scenes.domains import domain_problem
 from scenes.errors import SceneError
-from scenes.shards import SHARD, instances_in, shard_path, shard_problems
+from scenes.shards import SHARD, clear_partial, instances_in, shard_path, shard_problems
 from scenes.workers import Processes, Shard, ThisProcess, Workers
 
 AHEAD = 2
@@ -81,6 +81,7 @@ def generate(
                 _fill(plan, config, split, jobs, ray, report)
             except (SceneError, OSError) as error:
                 raise SceneError(f"{error}\n{plan.state()} in {out}") from error
+        clear_partial(split)
         for shard in plan.surplus():
             shutil.rmtree(shard)
         return write_manifest(config, out, plan.counts)

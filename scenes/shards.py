@@ -53,6 +53,12 @@ def written_aside(final: Path) -> Iterator[Path]:
             shutil.rmtree(aside, ignore_errors=True)
 
 
+def clear_partial(split: Path) -> None:
+    """Remove what killed workers have left of their shards."""
+    for leftover in split.glob(PARTIAL):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
 def write_sums(folder: Path) -> None:
     """Write the SHA-256 sums of all files below a folder, sorted by name, into its ``SHA256SUMS``."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())

@@ -21,56 +21,61 @@ if TYPE_CHECKING:
 Kind = Literal["crop", "window", "scene"]
 Domain = Literal["classic", "filament", "mitsuba"]
 Split = Literal["train", "val", "test"]
+Faces = Literal["physics", "uniform"]
+PARTS_HINT = "(default: the built-in ones)"
+SIZES_HINT = "(default: crop 256x256, window 320x320, scene 2208x1242)"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render:
     """Render a labelled data set in BOP layout, with COCO files.
 
-    What was finished is kept: stop it, run the same command again, and it goes on. The images depend on the settings
-    only, not on --jobs or --ray. `tagcell data recipes` lists settings by name.
+    Stop it whenever you like: the same command goes on from what is finished.
+
+    The images depend on the settings only, not on --jobs or --ray.
     """
 
-    recipe: str | None = None
+    recipe: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Settings by name; see `tagcell data recipes`."""
-    kind: Kind | None = None
-    """crop (the default): a window of the camera's frame round one part; window: one with any number of parts;
-    scene: a whole frame."""
-    part: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """A part to show; give it once for each. Default: the built-in ones."""
-    domain: Domain | None = None
-    """What draws the images. Default: classic."""
-    split: Split | None = None
-    """Which lights, backgrounds and camera heights to draw from. Default: train."""
-    count: int | None = None
-    """Number of images. Default: 1000. A data set can be made longer later."""
-    instances: int | None = None
-    """Instead of --count: go on until each part has been seen this often, a tenth of it at least."""
-    seed: int | None = None
-    """Seed of everything that is drawn. Default: 0."""
-    size: Annotated[str | None, arg(metavar="WxH")] = None
-    """Width and height of an image in pixels, like 256x256."""
-    downscale: int | None = None
-    """How many of the camera's pixels make one of a crop (default 1) or window (4), in each direction."""
-    faces: Literal["physics", "uniform"] | None = None
-    """Parts rest on their faces as often as physics leaves them there (the default), or equally often on each."""
-    jpeg: int | None = None
-    """Write colours as JPEG of this quality, 1 to 100. Default: PNG."""
+    kind: Annotated[Kind | None, arg(metavar="{crop,window,scene}", help_behavior_hint="(default: crop)")] = None
+    """A window of the camera's frame round one part; one with any number of parts; or a whole frame."""
+    part: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME", help_behavior_hint=PARTS_HINT)] = ()
+    """A part to show; may be given several times."""
+    domain: Annotated[
+        Domain | None, arg(metavar="{classic,filament,mitsuba}", help_behavior_hint="(default: classic)")
+    ] = None
+    """What draws the images."""
+    split: Annotated[Split | None, arg(metavar="{train,val,test}", help_behavior_hint="(default: train)")] = None
+    """Which lights, backgrounds and camera heights to draw from."""
+    count: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1000)")] = None
+    """Number of images. A data set can be made longer later."""
+    instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Instead of --count: go on until each part has been seen N times, a tenth of it at least."""
+    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
+    """Seed of everything that is drawn."""
+    size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint=SIZES_HINT)] = None
+    """Width and height of an image in pixels."""
+    downscale: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: crop 1, window 4)")] = None
+    """How many of the camera's pixels, in each direction, make one of a crop or window."""
+    faces: Annotated[Faces | None, arg(metavar="{physics,uniform}", help_behavior_hint="(default: physics)")] = None
+    """Parts rest on their faces as often as physics leaves them there, or equally often on each."""
+    jpeg: Annotated[int | None, arg(metavar="QUALITY", help_behavior_hint="(default: PNG)")] = None
+    """Write colours as JPEG of this quality, 1 to 100."""
     no_depth: FlagCreatePairsOff[bool] = False
     """Leave the depth images out."""
-    shard: int | None = None
-    """Images a folder. Default: about ten seconds of work."""
-    parts_dir: Path | None = None
+    shard: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: ten seconds of work)")] = None
+    """Images a folder, at most 1000."""
+    parts_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
     jobs: int = os.cpu_count() or 1
     """Worker processes, of one core each."""
-    ray: Annotated[str | None, arg(metavar="ADDRESS|local")] = None
+    ray: Annotated[str | None, arg(metavar="ADDRESS|local", help_behavior_hint="")] = None
     """Share the work out over the Ray cluster at this address, or over one that is started here with --jobs workers.
     --out must be a folder that all its machines share."""
     verify: FlagCreatePairsOff[bool] = False
     """First compare everything that is there with its checksums."""
-    out: Path | None = None
-    """Folder of the data set. Default: data/RECIPE or data/KINDs."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: data/RECIPE or data/KINDs)")] = None
+    """Folder of the data set."""
     json: FlagCreatePairsOff[bool] = False
     """Print where the data set is and what it holds as JSON."""
 
@@ -107,7 +112,8 @@ class Render:
             has = getattr(config, name)
             if name != "parts_dir" and value != has:
                 raise SceneError(
-                    f"{_option(name)} contradicts recipe {self.recipe!r}, whose {name} is {has}; leave one of them out"
+                    f"{_option(name, value)} contradicts recipe {self.recipe!r}, whose {name} is {has}; "
+                    "leave one of them out"
                 )
         return dataclasses.replace(config, parts_dir=self.parts_dir)
 
@@ -155,9 +161,9 @@ class DataSheet:
     """Crops, windows or whole frames."""
     split: Split = "train"
     """Which lights, backgrounds and camera heights to draw from."""
-    part: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """A part to show; give it once for each. Default: the built-in ones."""
-    parts_dir: Path | None = None
+    part: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME", help_behavior_hint=PARTS_HINT)] = ()
+    """A part to show; may be given several times."""
+    parts_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
     seed: int = 0
     """Seed of everything that is drawn."""
@@ -224,5 +230,10 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _option(name: str) -> str:
-    return {"parts": "--part", "depth": "--no-depth"}.get(name, f"--{name}")
+def _option(name: str, value: Any) -> str:
+    """An option as it was given."""
+    if name == "depth":
+        return "--no-depth"
+    if name == "parts":
+        return " ".join(f"--part {part}" for part in value)
+    return f"--{name} {'x'.join(map(str, value)) if name == 'size' else value}"
