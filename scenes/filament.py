@@ -47,8 +47,10 @@ def filament_problem() -> str:
 class FilamentRenderer:
     """MuJoCo's Filament. Meshes and textures are uploaded once; all else is what model and data say at each render.
 
-    Colours are shaded once a pixel and antialiased by coverage (see ``scenes.coverage``); instances and depth are of
-    pixel centres. ``rgb`` is float32 and saturates at 255. Shadows are hard whatever the size of a lamp.
+    ``rgb`` is float32, linear in light, and tells levels up to 1.5 times saturation in steps of 1.5. Colours are shaded
+    once a pixel and antialiased by coverage (see ``scenes.coverage``); instances and depth are of pixel centres. The
+    first lamp that casts shadows shines in parallel rays, and its size makes them soft; the others cast none. Where no
+    environment is on, the headlight's ambient colour comes from all around. The sky behind everything is black.
     """
 
     def __init__(self, model: mujoco.MjModel, *, max_width: int, max_height: int) -> None:

@@ -22,9 +22,11 @@ SCALE = 20.0
 RANGE = 100.0 * SCALE
 DIRECTIONAL_DISTANCE, DIRECTIONAL_CONE_DEG = 10.0 * SCALE, 60.0
 """A directional lamp without shadows is a spot so far away and so wide: Filament has one directional light only."""
-SHADOW_COARSENING = 2
-"""Shadow maps are this much coarser than the classic renderer's: Filament smooths their borders over a texel, which
-should be about a pixel as there is one sample of a shadow a pixel."""
+CASTER_HEIGHT_M = 1.5e-3
+"""Height over the board of what casts the shadows that are to be as soft as the lamp's size makes them."""
+SHADOW_COARSENING, COARSEST_SHADOWS = 2, 96
+"""Shadow maps have at most the size of the classic renderer's over this, as a texel should not be finer than a pixel,
+each of which has one sample of a shadow; and at least that many texels a side."""
 PLAIN_FACE = 4
 """Pixels along each side of a face of a plain surround."""
 SOFT_RIM = 0.02
@@ -66,7 +68,7 @@ class FilamentScene:
         """Make the scene what the model and its forwarded data say now."""
         description = self._reader.read(data)
         self._place(description.geoms)
-        self._light(description.lamps)
+        self._light(description.lamps, self._shadow_side(description.geoms))
         self._surround_with(description)
 
     def _renderable(self, geom: int) -> mjrf.Renderable:
@@ -102,12 +104,12 @@ class FilamentScene:
             material.color_texture = self._texture(finish.texture)
         return material
 
-    def _light(self, lamps: tuple[DrawnLamp, ...]) -> None:
+    def _light(self, lamps: tuple[DrawnLamp, ...], shadow_side: float) -> None:
         """The first lamp that casts shadows is Filament's one directional light; the others cast none."""
         model = self._model
         casting = (lamp for lamp in lamps if model.light(lamp.name).castshadow)
         sun = next(casting, None)
-        self._shine(sun)
+        self._shine(sun, shadow_side)
         others = {lamp.name: lamp for lamp in lamps if lamp is not sun}
         for name in self._lamps.keys() - others.keys():
             self.scene.remove_light(self._lamps.pop(name))
@@ -120,7 +122,7 @@ class FilamentScene:
                 self.scene.add_light(self._lamps[name])
             self._aim(self._lamps[name], lamp)
 
-    def _shine(self, lamp: DrawnLamp | None) -> None:
+    def _shine(self, lamp: DrawnLamp | None, shadow_side: float) -> None:
         """Light and shadows of a lamp, parallel and as strong everywhere as at the middle of the scene."""
         self._sun.set_cast_shadow(lamp is not None)
         if lamp is None:
@@ -131,7 +133,24 @@ class FilamentScene:
         self._sun.set_pose((SCALE * lamp.position).astype(np.float32), lamp.direction.astype(np.float32))
         self._sun.set_color((np.array(lamp.rgb) / brightest).astype(np.float32))
         self._sun.set_intensity(brightest / away**2 * WHITE)
-        self._sun.set_shadow_map_size(int(self._model.vis.quality.shadowsize) // SHADOW_COARSENING)
+        self._sun.set_shadow_map_size(self._shadow_map_size(shadow_side, lamp.radius_m / away))
+
+    def _shadow_side(self, geoms: tuple[DrawnGeom, ...]) -> float:
+        """About the side in metres of the square that shadows are computed for: Filament fits it to what casts them."""
+        model = self._model
+        largest = 2 * model.vis.map.shadowclip * model.stat.extent
+        casters = [drawn for drawn in geoms if model.geom_castshadow[drawn.geom]]
+        if not casters:
+            return largest
+        middles = np.array([drawn.T_world_geom[:3, 3] for drawn in casters])
+        radii = model.geom_rbound[[drawn.geom for drawn in casters]][:, None]
+        return min(largest, float(((middles + radii).max(axis=0) - (middles - radii).min(axis=0)).max()))
+
+    def _shadow_map_size(self, side: float, half_angle: float) -> int:
+        """Filament smooths the border of a shadow over a texel, which is made as wide as the lamp makes it soft."""
+        soft = 2 * half_angle * CASTER_HEIGHT_M
+        finest = self._model.vis.quality.shadowsize // SHADOW_COARSENING
+        return int(np.clip(side / max(soft, 1e-9), min(COARSEST_SHADOWS, finest), finest))
 
     def _aim(self, light: mjrf.Light, lamp: DrawnLamp) -> None:
         """A lamp without shadows. Directional light comes from a spot some way from the middle of the scene."""

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from cad.parts import load_part
-from cad.spatial import BASLER, rotation_z, transform
+from cad.spatial import BASLER, Intrinsics, rotation_z, transform
 from scenes.camera import add_camera
 from scenes.classic import ClassicRenderer
 from scenes.coverage import antialias
@@ -100,7 +100,9 @@ class Plate:
 
     def level(self, x=10):
         """Mean colour (3,) of the plate near the window's left border."""
-        return self.draw().rgb[60:68, x : x + 8].mean(axis=(0, 1))
+        rgb = self.draw().rgb
+        assert rgb is not None
+        return rgb[60:68, x : x + 8].mean(axis=(0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +223,18 @@ def test_the_first_lamp_casts_shadows_where_it_should(plate):
     assert rows.min() > 66, "the lamp stands on the side of +y, up in the picture"
     assert columns.mean() == pytest.approx(63.5, abs=1)
     assert 200 < darker.sum() < 45**2
+
+
+def test_a_larger_lamp_casts_softer_shadows(plate):
+    fine = Intrinsics(width=256, height=256, fx=4 * BASLER.fx, fy=4 * BASLER.fy, cx=127.5, cy=127.5)
+    widths = []
+    for radius in (0.0, 0.05):
+        plate.model.light_bulbradius[0] = radius
+        row = plate.renderer.render(plate.data, fine, ("rgb",)).rgb[235, 128:250, 0]
+        dark, lit = row[0], row[-1]
+        assert dark < 0.8 * lit
+        widths.append(np.count_nonzero((row > dark + 0.1 * (lit - dark)) & (row < lit - 0.1 * (lit - dark))))
+    assert widths[1] > widths[0] + 2
 
 
 CHANGES = {
