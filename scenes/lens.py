@@ -33,6 +33,8 @@ class Lens:
     def __post_init__(self) -> None:
         if not all(np.isfinite(self.coefficients)):
             raise SceneError(f"lens coefficients {self.coefficients}: must be finite")
+        if self.straight:
+            return
         radius = np.hypot(BASLER.width / BASLER.fx, BASLER.height / BASLER.fy) / 2
         r = np.linspace(0, 1.2 * radius, 50)
         growth = 1 + 3 * self.k1 * r**2 + 5 * self.k2 * r**4 - 6 * (abs(self.p1) + abs(self.p2)) * r
