@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.spatial import Array, Intrinsics
+from cad.spatial import Intrinsics
 from scenes.camera import CAMERA, camera_pose
 from scenes.errors import SceneError
 from scenes.gl import mujoco
+from scenes.path_view import MM, View, check_window
 from scenes.photoreal import load_mitsuba, mitsuba_problem
 from scenes.render import ALL, Rendering, What
 from scenes.scene_export import (
@@ -42,17 +43,13 @@ SCENE = {"type": "scene", "embree_use_robust_intersections": True}
 """Rays do not slip through between two triangles."""
 SMOOTHEST = 0.03
 """Roughness below which highlights of lamps would be too bright to average."""
-MM = 1000.0
-NEAR_M, FAR_M = 0.01, 100.0
-CAM_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera looks along +z with x to the left and y up."""
 PARALLEL_M = 100.0
 NO_LAMP_RADIUS_M = 1e-6
 """A lamp that is smaller than this is a point."""
 
 
 class MitsubaRenderer:
-    """Path tracing with ``samples`` a pixel (a power of 4 spreads them best) and a box filter, linear and not clipped.
+    """Path tracing with ``samples`` a pixel (a power of 2 spreads them best) and a box filter, linear and not clipped.
 
     Instances and depth are of pixel centres. The noise is drawn from ``seed`` and from what is rendered: the same
     scene through the same window gives the same bytes, by any number of threads, and another scene other noise; so do
@@ -63,6 +60,8 @@ class MitsubaRenderer:
     def __init__(
         self, model: mujoco.MjModel, *, max_width: int, max_height: int, samples: int = SAMPLES, seed: int = 0
     ) -> None:
+        if samples < 1:
+            raise SceneError(f"{samples} samples a pixel: must be at least 1")
         self._mi = load_mitsuba()
         self._model, self._size = model, (max_width, max_height)
         self._samples, self._seed = samples, seed
@@ -86,7 +85,7 @@ class MitsubaRenderer:
             raise SceneError("this renderer was closed; make a new MitsubaRenderer")
         check_window(intrinsics, self._size)
         scene = self._reader.read(data)
-        view = _View(intrinsics, camera_pose(self._model, data, camera), scene)
+        view = View(intrinsics, camera_pose(self._model, data, camera), scene)
         used: dict[Any, Any] = {}
         shapes = {f"geom_{geom.geom:05d}": self._shape(geom, view, used) for geom in scene.geoms}
         rgb = instances = depth = None
@@ -116,7 +115,7 @@ class MitsubaRenderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _draw_colours(self, scene: Any, view: _View) -> NDArray[np.float32]:
+    def _draw_colours(self, scene: Any, view: View) -> NDArray[np.float32]:
         """Grey levels (H, W, 3): the mean of several groups of samples, none of which may be far above their median.
 
         A path that finds a lamp by way of a mirror is rare and bright; alone in its pixel it would be a white speck.
@@ -130,7 +129,7 @@ class MitsubaRenderer:
         limit = SPECK_FACTOR * np.median(levels, axis=0) + SPECK_LEVEL
         return 255 * np.minimum(levels, limit).mean(axis=0)
 
-    def _draw(self, scene: Any, integrator: Any, view: _View, samples: int, seed: int) -> NDArray[np.float32]:
+    def _draw(self, scene: Any, integrator: Any, view: View, samples: int, seed: int) -> NDArray[np.float32]:
         """What an integrator makes of a scene, (H, W, channels), drawn in bands that fit into memory."""
         whole = view.intrinsics
         rows = max(1, SAMPLES_AT_ONCE // (whole.width * samples))
@@ -156,7 +155,7 @@ class MitsubaRenderer:
         order[numbers] = np.argsort(np.argsort(ids)) + 1
         return order
 
-    def _shape(self, geom: DrawnGeom, view: _View, used: dict[Any, Any]) -> Any:
+    def _shape(self, geom: DrawnGeom, view: View, used: dict[Any, Any]) -> Any:
         finish = geom.finish
         if finish not in used:
             used[finish] = self._kept.get(finish) or self._surface(finish)
@@ -195,8 +194,9 @@ class MitsubaRenderer:
         }
         return self._mi.load_dict({"type": "twosided", "surface": surface})
 
-    def _lights(self, scene: SceneDescription, view: _View, used: dict[Any, Any]) -> dict[str, Any]:
-        lights: dict[str, Any] = {lamp.name: _lamp(self._mi, lamp, view) for lamp in scene.lamps if any(lamp.rgb)}
+    def _lights(self, scene: SceneDescription, view: View, used: dict[Any, Any]) -> dict[str, Any]:
+        lamps = [_lamp(self._mi, lamp, view) for lamp in scene.lamps if any(lamp.rgb)]
+        lights: dict[str, Any] = {f"lamp_{i:02d}": lamp for i, lamp in enumerate(lamps)}
         if scene.environment >= 0:
             key = (scene.environment, scene.environment_radiance)
             used[key] = self._kept.get(key) or self._environment(*key)
@@ -211,81 +211,7 @@ class MitsubaRenderer:
         return self._mi.load_dict({"type": "envmap", "bitmap": panorama, "scale": radiance, "to_world": upright})
 
 
-class _View:
-    """A window of a camera, and the frame that Mitsuba works in: millimetres from where the window looks.
-
-    ``parts`` (3,) is the middle of the parts in the world, or of everything where there are none.
-
-    Mitsuba leaves a gap of 1e-4 of a point's coordinates between a surface and the rays that start there; so far from
-    the origin or in metres, small parts would lose their shadows.
-    """
-
-    def __init__(self, intrinsics: Intrinsics, T_world_cam: Array, scene: SceneDescription) -> None:
-        self.intrinsics = intrinsics
-        self._T_world_cam = T_world_cam
-        middle = [(intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2]
-        ray = T_world_cam[:3, :3] @ intrinsics.rays(middle)
-        parts = [geom for geom in scene.geoms if geom.instance >= 0] or scene.geoms
-        self.parts = np.mean([geom.T_world_geom[:3, 3] for geom in parts], axis=0) if parts else np.zeros(3)
-        self._origin = T_world_cam[:3, 3] + ray * ((self.parts - T_world_cam[:3, 3]) @ T_world_cam[:3, 2])
-        self._moved = np.concatenate([geom.T_world_geom for geom in scene.geoms]) if scene.geoms else np.zeros((4, 4))
-
-    def signature(self, seed: int) -> bytes:
-        """Differs where the seed, the window, the camera or anything's pose differs."""
-        i = self.intrinsics
-        head = [seed, i.width, i.height, i.fx, i.cx, i.cy]
-        return np.concatenate([head, self._T_world_cam.ravel(), self._moved.ravel()]).tobytes()
-
-    def local(self, points: Array) -> Array:
-        """World points (..., 3) in metres to Mitsuba's frame."""
-        return (points - self._origin) * MM
-
-    def depth_m(self, local: NDArray[np.float32]) -> Array:
-        """Metres along the camera's z of points (..., 3) in Mitsuba's frame."""
-        return (local.astype(np.float64) / MM + self._origin - self._T_world_cam[:3, 3]) @ self._T_world_cam[:3, 2]
-
-    def sensor(self, mi: ModuleType, window: Intrinsics, samples: int) -> dict[str, Any]:
-        """The camera through ``window``; one sample is that of the pixel's centre."""
-        width, height = window.width, window.height
-        T_local_cam = self._T_world_cam @ CAM_FROM_MITSUBA
-        T_local_cam[:3, 3] = self.local(T_local_cam[:3, 3])
-        return {
-            "type": "perspective",
-            "fov_axis": "x",
-            "fov": float(2 * np.degrees(np.arctan(width / (2 * window.fx)))),
-            "principal_point_offset_x": ((width - 1) / 2 - window.cx) / width,
-            "principal_point_offset_y": ((height - 1) / 2 - window.cy) / height,
-            "near_clip": NEAR_M * MM,
-            "far_clip": FAR_M * MM,
-            "to_world": mi.ScalarTransform4f(T_local_cam),
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "rfilter": {"type": "box"},
-                "pixel_format": "rgb",
-                "component_format": "float32",
-            },
-            "sampler": {"type": "multijitter", "sample_count": samples, "jitter": samples > 1},
-        }
-
-
-def check_window(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
-    """Raise SceneError for a window that is larger than ``size`` (width, height) or whose pixels are not square."""
-    width, height = intrinsics.width, intrinsics.height
-    if width > size[0] or height > size[1]:
-        raise SceneError(
-            f"a window of {width} x {height} does not fit into this renderer's {size[0]} x {size[1]}; "
-            "make the renderer with a larger max_width and max_height"
-        )
-    if abs(intrinsics.fx / intrinsics.fy - 1) > 1e-6:
-        raise SceneError(
-            f"focal lengths {intrinsics.fx} and {intrinsics.fy} differ; the mitsuba domain draws square pixels only, "
-            "use one focal length or the classic domain"
-        )
-
-
-def _lamp(mi: ModuleType, lamp: DrawnLamp, view: _View) -> dict[str, Any]:
+def _lamp(mi: ModuleType, lamp: DrawnLamp, view: View) -> dict[str, Any]:
     """A ball or point that shines alike in all directions; parallel light comes from a ball that is far away.
 
     That ball is seen under the same angle as the lamp's bulb from the middle of the parts, so shadows are as soft.

@@ -54,5 +54,8 @@ def load_mitsuba() -> ModuleType:
     if library:
         os.environ[LLVM_VARIABLE] = library
     mitsuba = import_module("mitsuba")
-    mitsuba.set_variant("llvm_ad_rgb" if library else "scalar_rgb")
+    try:
+        mitsuba.set_variant("llvm_ad_rgb" if library else "scalar_rgb")
+    except ImportError:
+        mitsuba.set_variant("scalar_rgb")
     return mitsuba

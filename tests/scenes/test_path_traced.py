@@ -119,6 +119,8 @@ def test_what_it_refuses_it_names(lit_ball, renderer):
     _, data = lit_ball
     with pytest.raises(SceneError, match=f"does not fit into this renderer's {SIZE} x {SIZE}"):
         renderer.render(data, BASLER)
+    with pytest.raises(SceneError, match="0 samples a pixel: must be at least 1"):
+        MitsubaRenderer(lit_ball[0], max_width=8, max_height=8, samples=0)
     with pytest.raises(SceneError, match="draws square pixels only"):
         renderer.render(data, replace(WINDOW, fy=WINDOW.fx * 1.01))
     renderer.close()
