@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import typing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +53,19 @@ def test_every_range_has_limits_that_hold_its_default_and_refuse_what_is_beyond(
             middle = (limits.low + limits.high) / 2
             with pytest.raises(SceneError, match=f"range {field.name} = .*low end"):
                 kind(**{field.name: (limits.high, middle)})
+
+
+def test_the_documented_ranges_are_the_real_ones():
+    text = (Path(__file__).parents[2] / "docs" / "looks.md").read_text()
+
+    def shown(value):
+        return f"{value[0]:g} to {value[1]:g}" if isinstance(value, tuple) else f"{value:g}"
+
+    splits = ((LOOKS["train"], LOOKS["test"]), (VIEWS["train"], VIEWS["test"]), (SensorRanges(), SensorRanges()))
+    for train, test in splits:
+        for name, value in vars(train).items():
+            other = getattr(test, name)
+            assert f"| `{name}` | {shown(value)} | {shown(other) if other != value else 'same'} |" in text
 
 
 def test_not_a_number_is_refused():
