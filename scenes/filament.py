@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from scenes.filament_view import FilamentView
 
 INSTALL_FILAMENT = "pip install --upgrade mujoco"
-PIXELS_AT_ONCE = 1 << 22
-"""Larger windows are drawn in bands of rows, which bounds the memory that a render takes."""
+TILE = 2048
+"""Larger windows are drawn in squares of this many pixels a side, which bounds the memory that a render takes."""
 
 
 @cache
@@ -81,12 +81,17 @@ class FilamentRenderer:
                 "make the renderer with a larger max_width and max_height"
             )
         T_world_cam = camera_pose(self._model, data, camera)
+        if not np.isclose(np.linalg.det(T_world_cam[:3, :3]), 1.0):
+            raise SceneError(f"camera {camera!r} has no pose; forward the data first (mj_forward)")
         self._view.update(data)
-        rows = max(PIXELS_AT_ONCE // width, 1)
-        bands = [intrinsics.crop(0, y, width, min(rows, height - y)) for y in range(0, height, rows)]
-        drawn = [vars(self._draw(self._view, band, T_world_cam, what)) for band in bands]
-        wanted = [name for name, image in drawn[0].items() if image is not None]
-        return Rendering(**{name: np.concatenate([images[name] for images in drawn]) for name in wanted})
+        rows = [[vars(self._draw(self._view, tile, T_world_cam, what)) for tile in row] for row in _tiles(intrinsics)]
+        return Rendering(
+            **{
+                name: np.concatenate([np.concatenate([tile[name] for tile in row], axis=1) for row in rows])
+                for name, image in rows[0][0].items()
+                if image is not None
+            }
+        )
 
     def close(self) -> None:
         """Free what is on the device; closing twice is harmless."""
@@ -105,3 +110,14 @@ class FilamentRenderer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _tiles(window: Intrinsics) -> list[list[Intrinsics]]:
+    """Rows of windows that together are one window."""
+    return [
+        [
+            window.crop(x, y, min(TILE, window.width - x), min(TILE, window.height - y))
+            for x in range(0, window.width, TILE)
+        ]
+        for y in range(0, window.height, TILE)
+    ]

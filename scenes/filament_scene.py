@@ -128,7 +128,11 @@ class FilamentScene:
         if lamp is None:
             self._sun.set_intensity(0.0)
             return
-        away = 1.0 if lamp.kind == "directional" else float(np.linalg.norm(self._aimed_at(lamp) - lamp.position))
+        away = (
+            1.0
+            if lamp.kind == "directional"
+            else max(float(np.linalg.norm(self._aimed_at(lamp) - lamp.position)), 1e-3)
+        )
         brightest = max(*lamp.rgb, 1e-9)
         self._sun.set_pose((SCALE * lamp.position).astype(np.float32), lamp.direction.astype(np.float32))
         self._sun.set_color((np.array(lamp.rgb) / brightest).astype(np.float32))

@@ -29,6 +29,8 @@ SAMPLES = np.array([(x + s, y + s) for s in SHIFTS for y in (-0.25, 0.25) for x 
 
 REACH = (0.02 + BASLER.width / 2 / BASLER.fx, 0.02 + BASLER.height / 2 / BASLER.fy)
 """Tangents of half the angles of the camera's whole view, with room for windows that go a little beyond the frame."""
+LARGEST_VIEW = 16384
+"""Pixels along each side of the largest view that Vulkan's drivers draw; a larger one would end the process."""
 MARGIN = 1
 """Pixels drawn round a window, whose colours the antialiasing of its border needs."""
 _INSIDE = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
@@ -139,10 +141,12 @@ def _whole(window: Intrinsics) -> tuple[int, int, int, int]:
     """Left, top, width and height, in a window's pixels, of the camera's whole view round it.
 
     Filament fits shadow maps to what it is told to draw. It is told to draw the whole view, of which only the window
-    lies in the target, so that shadows are the same in every window.
+    lies in the target, so that shadows are the same in every window. A view of too many pixels is the window alone.
     """
     half_width = math.ceil(max(REACH[0] * window.fx, window.cx + 1, window.width - window.cx))
     half_height = math.ceil(max(REACH[1] * window.fy, window.cy + 1, window.height - window.cy))
+    if 2 * max(half_width, half_height) > LARGEST_VIEW:
+        return 0, 0, window.width, window.height
     return math.floor(window.cx) - half_width, math.floor(window.cy) - half_height, 2 * half_width, 2 * half_height
 
 

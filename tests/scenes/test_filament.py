@@ -15,7 +15,7 @@ from scenes.classic import ClassicRenderer
 from scenes.coverage import antialias
 from scenes.domains import make_renderer
 from scenes.errors import SceneError
-from scenes.filament import FilamentRenderer
+from scenes.filament import TILE, FilamentRenderer
 from scenes.gl import mujoco
 from scenes.look import add_material, add_raw_mesh, add_texture, add_visual
 from scenes.render import HIDDEN_GROUP
@@ -132,7 +132,7 @@ def cell():
     ]
     set_parts(model, data, config.T_world_board @ np.stack(T_board_part))
     classic = ClassicRenderer(model, max_width=512, max_height=512)
-    filament = make_renderer("filament", model, max_width=512, max_height=512)
+    filament = make_renderer("filament", model, max_width=2200, max_height=512)
     yield data, classic, filament
     classic.close()
     filament.close()
@@ -161,6 +161,15 @@ def test_a_crop_window_is_a_part_of_a_larger_one(cell):
     differs = np.abs(crop.rgb - whole.rgb[part]).max(axis=-1)
     assert differs.mean() < 0.05
     assert (differs > 3).mean() < 0.002
+
+
+def test_a_window_drawn_in_pieces_has_no_seam(cell):
+    data, _, filament = cell
+    strip = BASLER.crop(2720 - TILE, 1800, TILE + 40, 32)
+    whole, crop = filament.render(data, strip), filament.render(data, strip.crop(TILE - 40, 0, 80, 32))
+    np.testing.assert_array_equal(crop.instances, whole.instances[:, -80:])
+    assert len(np.unique(crop.instances)) > 1
+    assert (np.abs(crop.rgb - whole.rgb[:, -80:]).max(axis=-1) > 3).mean() < 0.002
 
 
 def test_pictures_repeat_to_the_byte(cell):
@@ -305,6 +314,8 @@ def test_a_closed_renderer_and_a_window_too_large_are_refused(plate):
     renderer = FilamentRenderer(plate.model, max_width=64, max_height=64)
     with pytest.raises(SceneError, match="128 x 128 does not fit into this renderer's 64 x 64"):
         renderer.render(plate.data, WINDOW)
+    with pytest.raises(SceneError, match="mj_forward"):
+        renderer.render(mujoco.MjData(plate.model), WINDOW.crop(0, 0, 8, 8))
     renderer.close()
     renderer.close()
     with pytest.raises(SceneError, match="closed"):
