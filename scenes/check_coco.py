@@ -12,6 +12,7 @@ from scenes.findings import Findings
 
 FORMAT = "write it as COCO's format has it (docs/data.md)"
 UNIQUE = "number images and annotations through the whole data set"
+_LISTS = ("images", "annotations", "categories")
 
 
 def check_coco(scenes: Sequence[Scene], models: Models, findings: Findings) -> None:
@@ -24,15 +25,19 @@ def check_coco(scenes: Sequence[Scene], models: Models, findings: Findings) -> N
         content = findings.read_json(path, FORMAT)
         if content is None:
             continue
-        missing = [name for name in ("images", "annotations", "categories") if not isinstance(content.get(name), list)]
+        missing = [name for name in _LISTS if not isinstance(content.get(name), list)]
         if missing:
             findings.add(path, f"lacks the lists {', '.join(missing)}", FORMAT)
+            continue
+        everything = [entry for name in _LISTS for entry in content[name]]
+        if not all(isinstance(entry, dict) and type(entry.get("id")) is int for entry in everything):
+            findings.add(path, "lists things that are no objects with a whole number as id", FORMAT)
             continue
         ours = (findings.root / "dataset.json").exists()
         for name in ("images", "annotations"):
             ids = [entry.get("id") for entry in content[name]]
-            if len(set(ids)) != len(ids) or not all(isinstance(i, int) for i in ids):
-                findings.add(path, f"the ids of {name} are not different whole numbers", UNIQUE)
+            if len(set(ids)) != len(ids):
+                findings.add(path, f"the ids of {name} are not all different", UNIQUE)
                 continue
             again = [i for i in ids if (name, i) in used] if ours else []
             if again:
@@ -55,7 +60,7 @@ def _check_entries(path: Path, content: dict[str, Any], scene: Scene, models: Mo
     for unknown in sorted(set(categories) - set(models.diameters), key=str):
         findings.add(path, f"category {unknown} is none of the models", FORMAT)
     for entry in content["annotations"]:
-        image = names.get(entry.get("image_id"))
+        image = names.get(entry["image_id"]) if type(entry.get("image_id")) is int else None
         if image is None:
             findings.add(path, f"annotation {entry.get('id')} is of no image: {entry.get('image_id')}", FORMAT)
             continue
@@ -75,12 +80,12 @@ def _check_entries(path: Path, content: dict[str, Any], scene: Scene, models: Mo
 
 def _wrong(entry: dict[str, Any], categories: dict[Any, dict[str, Any]], image: dict[str, Any]) -> str:
     """What is wrong with an annotation by itself, empty when nothing is."""
-    if entry.get("category_id") not in categories:
+    if type(entry.get("category_id")) is not int or entry["category_id"] not in categories:
         return f"category {entry.get('category_id')} is not listed"
     if numbers(entry.get("bbox"), 4) is None or not isinstance(entry.get("area"), int | float):
         return "bbox or area is not of numbers"
-    if entry.get("iscrowd") not in (0, 1):
-        return f"iscrowd is {entry.get('iscrowd')!r}"
+    if entry.get("iscrowd") not in (0, 1) or type(entry.get("gt_id", 0)) is not int:
+        return f"iscrowd is {entry.get('iscrowd')!r}, gt_id {entry.get('gt_id')!r}"
     runs = entry.get("segmentation")
     if not isinstance(runs, dict) or runs.get("size") != [image.get("height"), image.get("width")]:
         return "segmentation is no run-length code of the image's size"
@@ -99,7 +104,7 @@ def _wrong(entry: dict[str, Any], categories: dict[Any, dict[str, Any]], image: 
 def _compare(path: Path, image: str, entry: dict[str, Any], scene: Scene, findings: Findings) -> None:
     """Whether one of our annotations says what BOP's files say."""
     k, truths, infos = entry["gt_id"], scene.truths.get(image, []), scene.infos.get(image)
-    if not isinstance(k, int) or not 0 <= k < len(truths):
+    if not 0 <= k < len(truths):
         findings.add(path, f"annotation {entry['id']}: gt_id {k} is not among {len(truths)} objects", FORMAT, image)
     elif truths[k]["obj_id"] != entry["category_id"]:
         told = f"category {entry['category_id']}, scene_gt.json has obj_id {truths[k]['obj_id']}"

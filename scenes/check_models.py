@@ -18,6 +18,7 @@ DIAMETER_MM = (1e3 * PART_SIZE_M[0], 1e3 * PART_SIZE_M[1])
 REMEDY = "write the models again, in millimetres"
 SAME = 0.02
 """Share of the diameter that sizes told and measured may differ by."""
+LARGEST = 1e12
 _FIELDS = ("diameter", *(f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"))
 
 
@@ -142,6 +143,6 @@ def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
 
 
 def numbers(values: Any, count: int) -> Array | None:
-    """``count`` finite numbers of a JSON list, None when they are anything else."""
+    """``count`` finite numbers of a JSON list, below LARGEST, None when they are anything else."""
     good = isinstance(values, list) and len(values) == count and all(isinstance(v, int | float) for v in values)
-    return np.array(values, np.float64) if good and np.isfinite(values).all() else None
+    return np.array(values, np.float64) if good and all(abs(v) < LARGEST for v in values) else None

@@ -56,6 +56,17 @@ def validate(folder: Path, *, sample: int = SAMPLE) -> Report:
     return Report(folder=folder, problems=tuple(findings.told()), counts=counts)
 
 
+def _listed(path: Path, manifest: dict[str, Any], findings: Findings) -> dict[str, dict[str, Any]]:
+    """The shards that a manifest lists."""
+    shards = manifest.get("shards", {})
+    entries = list(shards.values()) if isinstance(shards, dict) else [None]
+    good = [isinstance(e, dict) and type(e.get("images")) is int and isinstance(e.get("sha256"), str) for e in entries]
+    if not all(good):
+        findings.add(path, "shards are not listed with their images and SHA-256 sums", AGAIN)
+        return {}
+    return shards
+
+
 def _scenes(split: Path) -> list[Path]:
     return [path for path in sorted(split.glob("*")) if re.fullmatch(r"\d{6}", path.name) and path.is_dir()]
 
@@ -79,7 +90,7 @@ def _check_completeness(folder: Path, findings: Findings) -> None:
     if not (folder / "manifest.json").exists():
         findings.add(folder / "manifest.json", "is missing: the data set is not finished", AGAIN)
     manifest = findings.read_json(folder / "manifest.json", AGAIN) if (folder / "manifest.json").exists() else None
-    listed: dict[str, Any] = (manifest or {}).get("shards", {})
+    listed = _listed(folder / "manifest.json", manifest or {}, findings)
     for path in sorted(split.iterdir()) if split.is_dir() else []:
         if not re.fullmatch(r"\d{6}", path.name):
             findings.add(path, "is no part of the data set", "delete it")

@@ -235,7 +235,10 @@ def test_lengths_and_images_must_agree(foreign):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda c: c["annotations"][1].update(id=c["annotations"][0]["id"]), "ids of annotations are not different"),
+        (
+            lambda c: c["annotations"][1].update(id=c["annotations"][0]["id"]),
+            "ids of annotations are not all different",
+        ),
         (lambda c: c["annotations"][0].update(category_id=9), "category 9 is not listed"),
         (lambda c: c["annotations"][0].update(area=1), "area 1, scene_gt_info.json has"),
         (lambda c: c["annotations"][0]["segmentation"].update(size=[3, 4]), "no run-length code of the image's size"),
@@ -244,6 +247,7 @@ def test_lengths_and_images_must_agree(foreign):
         (lambda c: c["annotations"].pop(), "is visible but has no annotation"),
         (lambda c: c["images"][0].update(file_name="rgb/no.png"), "which is no image here"),
         (lambda c: c.pop("categories"), "lacks the lists categories"),
+        (lambda c: c["images"].append([]), "no objects with a whole number id"),
     ],
 )
 def test_coco_files_are_checked(ours, change, says):
