@@ -166,11 +166,8 @@ def _check_files(folder: Path, images: list[str], truths: dict[str, Any], findin
     places = [folder / name for name in COLOURS if (folder / name).is_dir()]
     if not places:
         findings.add(folder / "rgb", "is missing", "add the images")
-    masks = {
-        f"{_number(i):06d}_{k:06d}"
-        for i in images
-        for k in range(len(truths[i]) if isinstance(truths.get(i), list) else 0)
-    }
+    counts = {i: len(truths[i]) if isinstance(truths.get(i), list) else 0 for i in images}
+    masks = {f"{_number(i):06d}_{k:06d}" for i in images for k in range(counts[i])}
     stems = {f"{_number(i):06d}": i for i in images}
     for name in (*COLOURS, "depth", "mask", "mask_visib"):
         if not (folder / name).is_dir():

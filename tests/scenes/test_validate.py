@@ -247,7 +247,7 @@ def test_lengths_and_images_must_agree(foreign):
         (lambda c: c["annotations"].pop(), "is visible but has no annotation"),
         (lambda c: c["images"][0].update(file_name="rgb/no.png"), "which is no image here"),
         (lambda c: c.pop("categories"), "lacks the lists categories"),
-        (lambda c: c["images"].append([]), "no objects with a whole number id"),
+        (lambda c: c["images"].append([]), "no objects with a whole number as id"),
     ],
 )
 def test_coco_files_are_checked(ours, change, says):
