@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import Part
-from cad.spatial import BASLER, Array, Intrinsics
+from cad.spatial import BASLER, Intrinsics
 from cad.tagboard import TagboardConfig
 from scenes.camera import add_camera, set_camera_pose
 from scenes.distorted import DistortedRenderer
@@ -30,7 +30,7 @@ from scenes.look import (
     add_texture,
     add_visual,
 )
-from scenes.randomize import LIGHTS, Look, draw_distractor_surface, draw_part_surface
+from scenes.randomize import LIGHTS, Look, camera_above, draw_distractor_surface, draw_part_surface
 from scenes.ranges import LookRanges
 from scenes.render import HIDDEN_GROUP, Rendering, What
 from scenes.scene_export import WHITE_LUX
@@ -233,7 +233,7 @@ def _build(
         _add_slot(spec, name, name)
     body = spec.worldbody.add_body(name="board")
     add_board_visuals(spec, body, board)
-    add_camera(body, BASLER, _above())
+    add_camera(body, BASLER, camera_above(0.7))
     add_material(spec, "surroundings", (0.3, 0.3, 0.31, 1.0), specular=0.0, shininess=0.1)
     beneath = spec.worldbody.add_body(name="surroundings")
     table = beneath.add_geom(name="surroundings", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.01])
@@ -282,7 +282,3 @@ def _add_slot(spec: mujoco.MjSpec, name: str, mesh: str) -> None:
     body = spec.worldbody.add_body(name=name, mocap=True)
     add_material(spec, name, (0.7, 0.7, 0.7, 1.0), specular=0.5, shininess=0.5)
     add_visual(body, f"{name}_visual", mesh, material=name).group = HIDDEN_GROUP
-
-
-def _above() -> Array:
-    return np.array([[1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, -1.0, 0.7], [0, 0, 0, 1.0]])
