@@ -7,10 +7,13 @@ of its own, so attempts of the same shard never meet, and the first one that is 
 from __future__ import annotations
 
 import os
+import re
 import shutil
+import signal
 import socket
 import sys
 import tempfile
+import threading
 import time
 from contextlib import ExitStack, redirect_stdout, suppress
 from functools import lru_cache
@@ -176,10 +179,21 @@ def _connect(address: str, jobs: int, stack: ExitStack) -> Any:
         settings |= {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
         settings |= {"_node_ip_address": "127.0.0.1", "_temp_dir": folder}
     stack.callback(ray.shutdown)
+    usual = signal.getsignal(signal.SIGTERM)
     try:
+        _knock(address)
         ray.init(address, **settings)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, usual)  # Ray's own ends the process with a trace and leaves its workers
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         raise SceneError(
             f"no Ray cluster at {address!r}: {error}; start one (ray start --head), or use --ray {LOCAL}"
         ) from error
     return ray
+
+
+def _knock(address: str) -> None:
+    """Raise OSError where nobody listens, which Ray takes minutes to say."""
+    named = re.fullmatch(r"(?:ray://)?(.+):(\d+)", address)
+    if named:
+        socket.create_connection((named[1].strip("[]"), int(named[2])), timeout=10).close()

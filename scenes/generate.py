@@ -80,7 +80,7 @@ def generate(
             try:
                 _fill(plan, config, split, jobs, ray, report)
             except (SceneError, OSError) as error:
-                raise SceneError(f"{error}\n{plan.state()} in {out}") from error
+                raise SceneError(f"{error}\n{plan.state()} in {out}: the same command goes on from there") from error
         clear_partial(split)
         for shard in plan.surplus():
             shutil.rmtree(shard)
@@ -148,9 +148,9 @@ class Plan:
         return [shard for shard in sorted(self._split.glob(SHARD)) if int(shard.name) >= self._end]
 
     def state(self) -> str:
-        """What there is, in words."""
+        """What there is, in words; workers may have finished more than was counted."""
         wanted = "" if self._end is None else f" of {self._end}"
-        return f"{len(self.counts)}{wanted} shards are finished and kept"
+        return f"{len(list(self._split.glob(SHARD)))}{wanted} shards are finished and kept"
 
     def _shard(self, index: int) -> Shard:
         first, count = index * self._config.shard_size, self._config.shard_size

@@ -34,10 +34,7 @@ ONE_CORE = {
 }
 """Environment of a worker; what the user has set stays."""
 PATIENCE_S = 0.25
-DIED = (
-    "a worker died (signal 9: killed, or out of memory?); run the same command again to go on, "
-    "with fewer --jobs where memory was short"
-)
+DIED = "a worker died (signal 9: killed, or out of memory?); run the same command again, or with fewer --jobs"
 
 
 @dataclass(frozen=True, kw_only=True)

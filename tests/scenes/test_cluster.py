@@ -91,3 +91,8 @@ def test_without_ray_the_remedy_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", absent)
     with pytest.raises(SceneError, match=r"pip install 'tagcell\[ray\]'"):
         generate(CONFIG, tmp_path / "data", ray="local")
+
+
+def test_an_address_where_nobody_listens_is_refused_at_once(tmp_path):
+    with pytest.raises(SceneError, match=r"no Ray cluster at '127\.0\.0\.1:9': .*use --ray local"):
+        generate(CONFIG, tmp_path / "data", ray="127.0.0.1:9")
