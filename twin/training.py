@@ -11,6 +11,7 @@ from perception.fit_choice import ChoiceFitConfig, fit_choice
 from perception.train import trainer
 from scenes.generate import generate
 from scenes.recipes import load_recipe
+from twin.render_progress import image_progress
 from twin.robot import TwinError
 
 DATASETS = ("train_crops", "val_crops", "train_windows", "val_windows", "val_fine")
@@ -37,7 +38,9 @@ def train_all(*, data: Path, out: Path, minutes: float, seed: int, threads: int,
         raise TwinError(f"seed is {seed}; it must not be negative")
     for name in DATASETS:
         config = load_recipe(name)
-        generate(replace(config, seed=config.seed + 1000 * seed), data / name, jobs=jobs or os.cpu_count() or 1)
+        config = replace(config, seed=config.seed + 1000 * seed)
+        with image_progress(name) as report:
+            generate(config, data / name, jobs=jobs or os.cpu_count() or 1, report=report)
     written = []
     for name, (kind, share) in SHARES.items():
         train = trainer(name)
