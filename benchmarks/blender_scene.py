@@ -16,10 +16,11 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 SUN_OF_WHITE = math.pi
-"""Strength of a sun that makes a white matt surface facing it have the radiance 1."""
+BULB_OF_WHITE = 4 * math.pi**2
+"""Strength (W / m^2, W) of a sun and of a bulb 1 m away that a white matt surface facing them shows with radiance 1."""
 MASK_SAMPLES = 16
 
 
@@ -77,15 +78,19 @@ def _camera(scene: bpy.types.Scene, camera: dict) -> None:
 
 
 def _light(scene: bpy.types.Scene, folder: Path, content: dict) -> None:
-    """Directional lamps as suns, in an even surround or a panorama whose middle column looks along -x."""
-    for k, lamp in enumerate(content["lamps"]):
+    """Lamps, in an even surround or in a panorama whose middle column looks along -x."""
+    for lamp in content["lamps"]:
         strength = max(lamp["rgb"])
-        sun = bpy.data.lights.new(f"lamp_{k}", "SUN")
-        sun.energy, sun.angle = SUN_OF_WHITE * strength, lamp["angle"]
-        sun.color = [c / strength for c in lamp["rgb"]]
-        placed = bpy.data.objects.new(f"lamp_{k}", sun)
+        light = bpy.data.lights.new(lamp["name"], "SUN" if lamp["kind"] == "directional" else "POINT")
+        light.energy = strength * (SUN_OF_WHITE if light.type == "SUN" else BULB_OF_WHITE)
+        light.color = [c / strength for c in lamp["rgb"]]
+        if light.type == "POINT":
+            light.shadow_soft_size = lamp["radius_m"]
+        placed = bpy.data.objects.new(lamp["name"], light)
         scene.collection.objects.link(placed)
-        placed.matrix_world = Matrix(lamp["T_world_lamp"])
+        placed.location = lamp["position"]
+        placed.rotation_mode = "QUATERNION"
+        placed.rotation_quaternion = Vector(lamp["direction"]).to_track_quat("-Z", "Y")
     scene.world = bpy.data.worlds.new("world")
     scene.world.use_nodes = True
     nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links

@@ -51,7 +51,7 @@ class _Work:
 
 
 def measure_rate(config: DatasetConfig, workers: int, seconds: float) -> Rate:
-    """Make images with so many processes until ``seconds`` are over, in whole shards, at least two a worker.
+    """Make images with so many processes until ``seconds`` are over, in whole shards, at least one a worker.
 
     The clock starts when every worker has made its first image.
     """
@@ -99,7 +99,7 @@ def _work(config: DatasetConfig, split: Path, k: int, workers: int, seconds: flo
         start_s = time.time() - born
         _barrier.wait()
         wall, cpu, images, index = time.perf_counter(), time.process_time(), 0, k
-        while time.perf_counter() - wall < seconds or images < 2 * config.shard_size:
+        while time.perf_counter() - wall < seconds or images == 0:
             index += workers
             maker.make(Shard(index=index, first=index * config.shard_size, count=config.shard_size), lambda: None)
             images += config.shard_size

@@ -60,7 +60,7 @@ class Stopwatch:
     """CPU seconds of nested stages; each counts without those inside it."""
 
     def __init__(self) -> None:
-        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self.seconds: dict[str, float] = dict.fromkeys(STAGES, 0.0)
         self._open: list[str] = []
         self._last = time.process_time()
 
@@ -110,7 +110,7 @@ class TimedRenderer:
         camera: str = CAMERA,
     ) -> Rendering:
         """See :class:`Renderer`."""
-        labels = tuple(one for one in what if one != "rgb")
+        labels: tuple[What, ...] = tuple(one for one in what if one != "rgb")
         colours = drawn = Rendering()
         if "rgb" in what:
             with self._watch.stage("draw colours"):
