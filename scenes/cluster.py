@@ -6,6 +6,7 @@ of its own, so attempts of the same shard never meet, and the first one that is 
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -35,6 +36,8 @@ LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Where it is 0 when Ray is imported, a local Ray listens on 127.0.0.1 only, on every system."""
 OBJECT_STORE_BYTES = 100_000_000
 """Of a local Ray: images do not go through the object store."""
+TELLS_EVERY_S = 0.5
+"""How often a worker says how far it is."""
 SHOWS_WITHIN_S = 60.0
 """How long a network file system may take to show a folder that another machine has written."""
 
@@ -133,12 +136,14 @@ def make_shard(config: DatasetConfig, split: Path, wanted: dict[str, Any], shard
     if (shard_path(split, shard.index) / SUMS).is_file():
         return host
     _check_machine(config, split, wanted, host)
-    images = 0
+    images, told_at = 0, -math.inf
 
     def tick() -> None:
-        nonlocal images
+        nonlocal images, told_at
         images += 1
-        ledger.note.remote(shard.index, images)
+        if images == shard.count or time.monotonic() - told_at >= TELLS_EVERY_S:
+            told_at = time.monotonic()
+            ledger.note.remote(shard.index, images)
 
     _maker(config, split).make(shard, tick)
     return host
