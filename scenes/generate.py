@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from scenes.dataset_config import DatasetConfig
-from scenes.dataset_folder import opened, write_manifest
+from scenes.dataset_folder import MANIFEST, opened, write_manifest
 from scenes.domains import domain_problem
 from scenes.errors import SceneError
 from scenes.shards import SHARD, clear_partial, instances_in, shard_path, shard_problems
@@ -77,6 +77,7 @@ def generate(
         if verify:
             _verify(plan.kept)
         if not plan.complete:
+            (out / MANIFEST).unlink(missing_ok=True)
             try:
                 _fill(plan, config, split, jobs, ray, report)
             except (SceneError, OSError) as error:
