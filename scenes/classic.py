@@ -136,7 +136,9 @@ class ClassicRenderer:
         """Metres (H, W) from the reversed depth buffer (1 near, 0 far), bottom row first."""
         extent = self._model.stat.extent
         near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
-        return (near * far / (near + z[::-1].astype(np.float64) * (far - near))).astype(np.float32)
+        depth = z[::-1] * np.float32(far - near)
+        depth += np.float32(near)
+        return np.divide(np.float32(near * far), depth, out=depth)
 
 
 def _drop_stencil(context: mujoco.MjrContext) -> None:
