@@ -102,7 +102,7 @@ def expose(
     """
     levels = image.astype(np.float32)
     if sensor.exposure != 1.0 or any(sensor.gradient):
-        levels *= _illumination(sensor, image.shape[0], image.shape[1])
+        _illuminate(levels, sensor)
     sigma = sensor.blur_px / downscale
     if sigma > SHARP_PX:
         cv2.GaussianBlur(levels, (0, 0), sigma, dst=levels, borderType=cv2.BORDER_REFLECT_101)
@@ -135,11 +135,13 @@ def _read(
     return _tone(_converted(levels), sensor.gamma)
 
 
-def _illumination(sensor: SensorConfig, height: int, width: int) -> Levels:
-    """(H, W, 1) factor from exposure and uneven light."""
+def _illuminate(levels: Levels, sensor: SensorConfig) -> None:
+    """Multiply (H, W, 3) in place by exposure and uneven light, along rows and columns one after the other."""
+    height, width, colours = levels.shape
     across = 1 + sensor.gradient[0] * np.linspace(-1, 1, width)
-    down = 1 + sensor.gradient[1] * np.linspace(-1, 1, height)
-    return np.asarray(sensor.exposure * down[:, None, None] * across[:, None], np.float32)
+    down = sensor.exposure * (1 + sensor.gradient[1] * np.linspace(-1, 1, height))
+    levels *= np.asarray(down, np.float32)[:, None, None]
+    levels *= np.repeat(np.asarray(across, np.float32), colours).reshape(width, colours)
 
 
 def _deviation(levels: Levels, sensor: SensorConfig, downscale: float) -> Levels:
