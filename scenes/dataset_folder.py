@@ -1,8 +1,8 @@
 """The folder of a data set: what it is, that one run at a time writes into it, and what it holds when it is done.
 
 ``dataset.json`` is written before anything else and says what decides the bytes; a run that would make others is
-refused. ``manifest.json`` is written when everything is there. ``.lock`` is held, not merely present, while a run goes
-on, so one that was killed leaves nothing that has to be cleared away by hand.
+refused. ``manifest.json`` is written when everything is there, after a test set's list of targets. ``.lock`` is held,
+not merely present, while a run goes on, so one that was killed leaves nothing that has to be cleared away by hand.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
 from scenes.rests import RestPool
 from scenes.shards import clear_partial, images_in, shard_digest, shard_path
+from scenes.targets import TARGETS, targets_in
 
 GENERATOR = 1
 """Raise it with every change of the code that changes the bytes of any data set."""
@@ -80,7 +81,11 @@ def opened(config: DatasetConfig, out: Path) -> Iterator[Path]:
 
 
 def write_manifest(config: DatasetConfig, out: Path, shards: dict[int, Counter[int]]) -> dict[str, Any]:
-    """Say what a finished data set holds, from its shards' instances by ``obj_id``; returns what was written."""
+    """Say what a finished data set holds, from its shards' instances by ``obj_id``; returns what was written.
+
+    That of a test set stands beside BOP's list of what is to be found in each image. Raises SceneError when it cannot
+    be written.
+    """
     names = {part.obj_id: part.name for part in config.load_parts()}
     listed, instances = {}, Counter({name: 0 for name in names.values()})
     for index, counts in sorted(shards.items()):
@@ -92,7 +97,12 @@ def write_manifest(config: DatasetConfig, out: Path, shards: dict[int, Counter[i
         "instances": dict(instances),
         "shards": listed,
     }
-    _write_json(out / MANIFEST, content)
+    try:
+        if config.split == "test":
+            _write_json(out / TARGETS, targets_in(out / config.split / name for name in listed))
+        _write_json(out / MANIFEST, content)
+    except OSError as error:
+        raise SceneError(f"cannot write {out / MANIFEST}: {error}; the same command goes on from there") from error
     return content
 
 
@@ -149,7 +159,8 @@ def _prepare(config: DatasetConfig, wanted: dict[str, Any], out: Path) -> Path:
         _write_json(out / DATASET, wanted)
     elif there != wanted:
         _compare(there, wanted, out)
-        (out / MANIFEST).unlink(missing_ok=True)
+        for name in (MANIFEST, TARGETS):
+            (out / name).unlink(missing_ok=True)
         short = shard_path(split, (there["count"] or 0) // config.shard_size)
         if (there["count"] or 0) % config.shard_size and short.exists():
             shutil.rmtree(short)
@@ -212,7 +223,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _write_json(path: Path, content: Any) -> None:
     aside = path.with_name(f".{path.name}.partial")
     aside.write_text(json.dumps(content, indent=1))
     aside.replace(path)

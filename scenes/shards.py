@@ -84,18 +84,23 @@ def images_in(shard: Path) -> int:
     return sum(name.startswith("rgb/") for name in read_sums(shard))
 
 
-def instances_in(shard: Path) -> Counter[int]:
-    """How many instances of each ``obj_id`` a shard shows, at least VISIBLE of each; raises SceneError."""
+def seen_in(shard: Path) -> list[tuple[int, int]]:
+    """Image and ``obj_id`` of every instance that a shard shows, at least VISIBLE of each; raises SceneError."""
     try:
         truths, infos = (json.loads((shard / f"{n}.json").read_text()) for n in ("scene_gt", "scene_gt_info"))
-        return Counter(
-            truth["obj_id"]
+        return [
+            (int(image), truth["obj_id"])
             for image, listed in truths.items()
             for truth, info in zip(listed, infos[image], strict=True)
             if info["visib_fract"] >= VISIBLE
-        )
+        ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SceneError(f"the labels of {shard} cannot be read ({error}); {remedy(shard)}") from error
+
+
+def instances_in(shard: Path) -> Counter[int]:
+    """How many instances of each ``obj_id`` a shard shows, at least VISIBLE of each; raises SceneError."""
+    return Counter(obj_id for _, obj_id in seen_in(shard))
 
 
 def shard_problems(shard: Path) -> list[str]:

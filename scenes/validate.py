@@ -20,10 +20,11 @@ from scenes.check_pixels import check_pixels
 from scenes.errors import SceneError
 from scenes.findings import Findings, Report
 from scenes.shards import shard_digest, shard_problems
+from scenes.targets import TARGETS, check_targets
 
 SAMPLE = 100
 """Images whose pixels are compared."""
-OURS = {"dataset.json", "manifest.json", "camera.json", "models", "rests.npz", "cache.npz"}
+OURS = {"dataset.json", "manifest.json", "camera.json", "models", "rests.npz", "cache.npz", TARGETS}
 SPLITS = ("train", "val", "test")
 AGAIN = "render the data set again with the same command: what is there is kept"
 
@@ -39,13 +40,16 @@ def validate(folder: Path, *, sample: int = SAMPLE) -> Report:
             f"{folder} holds no images in BOP layout; name a folder with {', '.join(SPLITS)} (and so on) in it, and "
             "numbered folders in those"
         )
-    findings = Findings(root=folder)
-    if (folder / "dataset.json").exists():
+    findings, ours = Findings(root=folder), (folder / "dataset.json").exists()
+    if ours:
         _check_completeness(folder, findings)
     models = check_models(folder, findings)
     scenes = [scene for split in splits for path in _scenes(split) if (scene := check_scene(path, models, findings))]
     for split in splits:
         check_coco([scene for scene in scenes if scene.folder.parent == split], models, findings)
+    if (folder / TARGETS).exists() or (ours and splits[0].name == "test"):
+        tested = [scene for scene in scenes if scene.folder.parent.name.startswith("test")]
+        check_targets(folder / TARGETS, tested, findings, exact=ours)
     _check_sample(scenes, models, findings, sample)
     counts = {
         "folders": len(scenes),
