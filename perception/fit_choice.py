@@ -85,7 +85,7 @@ def collect_evidence(solver: CropSolver, crops: CropSet, report: Callable[[str],
     if crops.images.shape[1:3] != (CROP_PX, CROP_PX):
         raise PerceptionError(
             f"crops of {crops.images.shape[2]} x {crops.images.shape[1]} pixels; the choice is fitted on "
-            f"full-resolution crops of {CROP_PX} x {CROP_PX}: render them with `tagcell render --kind fine`"
+            f"full-resolution crops of {CROP_PX} x {CROP_PX}: render them with `tagcell render --recipe val_fine`"
         )
     truth = crops.labels(solver.nets.table.parts)
     out: list[CropEvidence] = []

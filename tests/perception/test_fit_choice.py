@@ -55,7 +55,7 @@ def test_half_resolution_crops_are_refused() -> None:
         K=np.tile(np.eye(3), (n, 1, 1)),
         packed_masks=np.zeros((n, 128, 16), np.uint8),
     )
-    with pytest.raises(PerceptionError, match="--kind fine"):
+    with pytest.raises(PerceptionError, match="--recipe val_fine"):
         collect_evidence(None, crops)  # pyright: ignore[reportArgumentType]
 
 
