@@ -25,6 +25,8 @@ SHARDS: dict[Domain, dict[Kind, int]] = {
 }
 """Images a shard: about ten seconds of work, so that little is lost when a run is stopped."""
 MAX_SHARD = 1000
+FACTORS = tuple(n for n in range(1, 65) if BASLER.width % n == 0 and BASLER.height % n == 0)
+"""How much smaller than the camera's frame crops and windows may be: by factors that leave whole pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +80,14 @@ class DatasetConfig:
             raise SceneError(f"jpeg {self.jpeg}: a quality from 1 to 100, or None for PNG")
         if self.kind == "scene" and self.downscale is not None:
             raise SceneError(f"downscale {self.downscale}: a scene is scaled to its size; leave downscale out")
-        width, height = self.pixels
+        if len(set(self.names)) < len(self.names):
+            raise SceneError(f"parts {', '.join(self.names)}: name each part once")
         smaller = 1 if self.kind == "scene" else int(self.scale_down)
+        if smaller not in FACTORS:
+            raise SceneError(
+                f"downscale {smaller}: must divide the camera's frame: one of {', '.join(map(str, FACTORS))}"
+            )
+        width, height = self.pixels
         most = (BASLER.width // smaller, BASLER.height // smaller)
         if not (32 <= width <= most[0] and 32 <= height <= most[1]):
             raise SceneError(f"size {width} x {height}: must be from 32 x 32 to {most[0]} x {most[1]} pixels")
@@ -140,8 +148,13 @@ class DatasetConfig:
         return self.shard or SHARDS[self.domain][self.kind]
 
     def load_parts(self) -> list[Part]:
-        """The parts shown, in order."""
-        return [load_part(name, self.parts_dir) for name in self.names]
+        """The parts shown, in order; raises SceneError for parts that labels could not tell apart."""
+        parts = [load_part(name, self.parts_dir) for name in self.names]
+        numbers = [part.obj_id for part in parts]
+        if len(set(numbers)) < len(numbers):
+            told = ", ".join(f"{part.name} {part.obj_id}" for part in parts)
+            raise SceneError(f"parts of one set need different obj_ids, not {told}; add one of them again")
+        return parts
 
 
 def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:
