@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import cv2
@@ -89,6 +90,8 @@ class RenderBenchmark:
     """Processes that make images at the same time."""
     images: int = 20
     """Pictures of the scene that all domains share."""
+    out: Path | None = None
+    """Folder on the disk that images are written to; the system's temporary one by default."""
     blender: Path | None = None
     """A Python interpreter that has bpy, to draw that scene with Cycles too."""
     strip: Path | None = None
@@ -167,8 +170,8 @@ def main(options: RenderBenchmark) -> None:
     """Measure and print."""
     asked: list[Name] = [name for name in CASES if name in options.only]
     chosen: list[Name] = [name for name in asked if not domain_problem(CASES[name].config.domain)]
-    rates = {name: measure_rate(CASES[name].config, options.workers, options.seconds) for name in chosen}
-    found = {name: stages(CASES[name].config, _few(rates[name], options.seconds)) for name in chosen}
+    with TemporaryDirectory(prefix="tagcell-render-", dir=options.out) as temporary:
+        rates, found = _measure(chosen, options, Path(temporary))
     sections = [rates_section(rates), stages_section(found), projection_section(rates)] if rates else []
     if "compare" in options.only:
         drawn = compare(options.images, options.blender)
@@ -179,6 +182,19 @@ def main(options: RenderBenchmark) -> None:
     notes = [f"{options.workers} workers, {options.seconds:g} s a row", f"load {os.getloadavg()[0]:.1f}"]
     notes += [f"no {domain}: {domain_problem(domain)}" for domain in missing]
     show(sections, "; ".join(notes), as_json=options.json)
+
+
+def _measure(
+    names: list[Name], options: RenderBenchmark, out: Path
+) -> tuple[dict[Name, Rate], dict[Name, dict[str, float]]]:
+    """Rates and stages. All files stay until the end: where many were deleted, ext4 is slow to make new ones."""
+    rates: dict[Name, Rate] = {}
+    found: dict[Name, dict[str, float]] = {}
+    for name in names:
+        config = CASES[name].config
+        rates[name] = measure_rate(config, out / name, options.workers, options.seconds)
+        found[name] = stages(config, out / f"{name}-stages", _few(rates[name], options.seconds))
+    return rates, found
 
 
 def _few(rate: Rate, seconds: float) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import resource
-import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -50,13 +49,13 @@ class _Work:
     memory_mb: float
 
 
-def measure_rate(config: DatasetConfig, workers: int, seconds: float) -> Rate:
-    """Make images with so many processes until ``seconds`` are over, in whole shards, at least one a worker.
+def measure_rate(config: DatasetConfig, out: Path, workers: int, seconds: float) -> Rate:
+    """Make images in the new folder ``out`` with so many processes until ``seconds`` are over, in whole shards.
 
-    The clock starts when every worker has made its first image.
+    The clock starts when every worker has made its first image; each makes at least one shard then.
     """
     context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory(prefix="tagcell-rate-") as temporary, opened(config, Path(temporary)) as split:
+    with opened(config, out) as split:
         pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(context.Barrier(workers),))
         with pool:
             born = time.time()
@@ -75,13 +74,11 @@ def measure_rate(config: DatasetConfig, workers: int, seconds: float) -> Rate:
     )
 
 
-def stages(config: DatasetConfig, images: int) -> dict[str, float]:
-    """CPU milliseconds of an image's stages, in a process of their own."""
+def stages(config: DatasetConfig, out: Path, images: int) -> dict[str, float]:
+    """CPU milliseconds of the stages of an image, made in the new folder ``out`` in a process of their own."""
     context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory(prefix="tagcell-stages-") as temporary:
-        pool = ProcessPoolExecutor(1, context, initializer=_start, initargs=(context.Barrier(1),))
-        with pool:
-            return pool.submit(measure_stages, config, Path(temporary), images).result()
+    with ProcessPoolExecutor(1, context, initializer=use_one_core, initargs=(config.domain,)) as pool:
+        return pool.submit(measure_stages, config, out, images).result()
 
 
 def _start(barrier: Barrier) -> None:
