@@ -27,6 +27,8 @@ from scenes.png import encode_png
 
 DEPTH_SCALE = 0.02
 """Millimetres a unit of the 16-bit depth images: steps of 20 um up to 1.3 m."""
+DEPTH_REACH_M = 65535 * DEPTH_SCALE / 1e3
+"""What is farther than this has no depth in the images."""
 MASKS = ("mask", "mask_visib")
 NO_BOX = (-1, -1, -1, -1)
 PART_SIZE_M = (5e-4, 1.0)

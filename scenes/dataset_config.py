@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from cad.parts import BUILT_IN, Part, load_part
 from cad.spatial import BASLER, Intrinsics
+from scenes.bop import DEPTH_REACH_M
 from scenes.domains import DOMAINS, Domain
 from scenes.errors import SceneError
 from scenes.ranges import LOOKS, VIEWS, LensRanges, LookRanges, SensorRanges, Split, ViewRanges
@@ -78,6 +79,9 @@ class DatasetConfig:
             raise SceneError(f"shard {self.shard}: must be 1 to {MAX_SHARD} images, as many as BOP allows a folder")
         if self.jpeg is not None and not 1 <= self.jpeg <= 100:
             raise SceneError(f"jpeg {self.jpeg}: a quality from 1 to 100, or None for PNG")
+        highest = self.view_ranges.height_m[1]
+        if self.depth and highest >= DEPTH_REACH_M:
+            raise SceneError(f"height_m up to {highest}: depth images reach {DEPTH_REACH_M} m; set depth to False")
         if self.kind == "scene" and self.downscale is not None:
             raise SceneError(f"downscale {self.downscale}: a scene is scaled to its size; leave downscale out")
         if len(set(self.names)) < len(self.names):

@@ -2,13 +2,17 @@
 
 import json
 import shutil
+from typing import get_args
 
 import pytest
 
 from cad.parts import LIBRARY
 from cad.spatial import BASLER
+from scenes import dataset_config
 from scenes.dataset_config import FACTORS, DatasetConfig
 from scenes.errors import SceneError
+from scenes.ranges import ViewRanges
+from twin import render_cli
 
 
 @pytest.mark.parametrize("kind", ["crop", "window"])
@@ -18,6 +22,13 @@ def test_a_pixel_is_a_whole_number_of_the_cameras(kind):
         assert (frame.width * factor, frame.height * factor) == (BASLER.width, BASLER.height)
     with pytest.raises(SceneError, match=r"downscale 7: .* one of 1, 2, 3, 4, 6, 8"):
         DatasetConfig(kind=kind, downscale=7, size=(32, 32))
+
+
+def test_the_board_is_no_farther_than_depth_images_reach():
+    far = ViewRanges(height_m=(1.2, 1.4))
+    assert DatasetConfig(view=far, depth=False).view_ranges == far
+    with pytest.raises(SceneError, match=r"height_m up to 1\.4: depth images reach 1\.31\d* m; set depth to False"):
+        DatasetConfig(view=far)
 
 
 def test_a_part_is_named_once():
@@ -45,3 +56,9 @@ def test_a_scene_is_the_middle_of_the_sensor(size):
     assert scale == pytest.approx(max(size[0] / BASLER.width, size[1] / BASLER.height))
     assert frame.cx - (size[0] - 1) / 2 == pytest.approx(scale * (BASLER.cx - (BASLER.width - 1) / 2))
     assert frame.cy - (size[1] - 1) / 2 == pytest.approx(scale * (BASLER.cy - (BASLER.height - 1) / 2))
+
+
+@pytest.mark.parametrize("name", ["Kind", "Domain", "Split", "Faces"])
+def test_the_command_line_offers_every_choice(name):
+    of_config = getattr(dataset_config, name)
+    assert get_args(getattr(render_cli, name)) == get_args(of_config)
