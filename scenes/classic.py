@@ -15,7 +15,7 @@ from cad.spatial import Intrinsics
 from scenes.camera import CAMERA, set_intrinsics
 from scenes.errors import SceneError
 from scenes.gl import make_context, mujoco
-from scenes.render import ALL, VISUAL_GROUPS, Rendering, What, instance_of_geom
+from scenes.render import ALL, VISUAL_GROUPS, Rendering, What, check_window, instance_of_geom
 
 
 class ClassicRenderer:
@@ -54,12 +54,7 @@ class ClassicRenderer:
         """See :class:`Renderer`. Raises SceneError for a window larger than the renderer was made for."""
         if not self._free.alive:
             raise SceneError("this renderer was closed; make a new ClassicRenderer")
-        width, height = intrinsics.width, intrinsics.height
-        if width > self._size[0] or height > self._size[1]:
-            raise SceneError(
-                f"a window of {width} x {height} does not fit into this renderer's {self._size[0]} x {self._size[1]}; "
-                "make the renderer with a larger max_width and max_height"
-            )
+        check_window(intrinsics, self._size)
         set_intrinsics(self._model, intrinsics, camera)
         self._gl.make_current()
         view = mujoco.MjvCamera()
@@ -67,7 +62,7 @@ class ClassicRenderer:
         view.fixedcamid = self._model.camera(camera).id
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, view, everything, self._scene)
-        rect = mujoco.MjrRect(0, 0, width, height)
+        rect = mujoco.MjrRect(0, 0, intrinsics.width, intrinsics.height)
         rgb = self._draw_rgb(rect) if "rgb" in what else None
         instances = depth = None
         if "instances" in what or "depth" in what:

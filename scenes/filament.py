@@ -16,7 +16,7 @@ from cad.spatial import Array, Intrinsics
 from scenes.camera import CAMERA, camera_pose
 from scenes.errors import SceneError
 from scenes.gl import mujoco
-from scenes.render import ALL, Rendering, What, instance_of_geom
+from scenes.render import ALL, Rendering, What, check_window, instance_of_geom
 from scenes.vulkan import INSTALL_VULKAN, vulkan_problem
 
 if TYPE_CHECKING:
@@ -74,12 +74,7 @@ class FilamentRenderer:
         """See :class:`Renderer`. Raises SceneError for a window larger than the renderer was made for."""
         if self._view is None:
             raise SceneError("this renderer was closed; make a new FilamentRenderer")
-        width, height = intrinsics.width, intrinsics.height
-        if width > self._size[0] or height > self._size[1]:
-            raise SceneError(
-                f"a window of {width} x {height} does not fit into this renderer's {self._size[0]} x {self._size[1]}; "
-                "make the renderer with a larger max_width and max_height"
-            )
+        check_window(intrinsics, self._size)
         T_world_cam = camera_pose(self._model, data, camera)
         if not np.isclose(np.linalg.det(T_world_cam[:3, :3]), 1.0):
             raise SceneError(f"camera {camera!r} has no pose; forward the data first (mj_forward)")

@@ -17,9 +17,9 @@ from cad.spatial import Intrinsics
 from scenes.camera import CAMERA, camera_pose
 from scenes.errors import SceneError
 from scenes.gl import mujoco
-from scenes.path_view import MM, View, check_window
+from scenes.path_view import MM, View, check_square
 from scenes.photoreal import load_mitsuba, mitsuba_problem
-from scenes.render import ALL, Rendering, What
+from scenes.render import ALL, Rendering, What, check_window
 from scenes.scene_export import (
     DrawnGeom,
     DrawnLamp,
@@ -84,6 +84,7 @@ class MitsubaRenderer:
         if self._reader is None:
             raise SceneError("this renderer was closed; make a new MitsubaRenderer")
         check_window(intrinsics, self._size)
+        check_square(intrinsics)
         scene = self._reader.read(data)
         view = View(intrinsics, camera_pose(self._model, data, camera), scene)
         used: dict[Any, Any] = {}

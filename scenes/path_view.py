@@ -77,14 +77,8 @@ class View:
         }
 
 
-def check_window(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
-    """Raise SceneError for a window that is larger than ``size`` (width, height) or whose pixels are not square."""
-    width, height = intrinsics.width, intrinsics.height
-    if width > size[0] or height > size[1]:
-        raise SceneError(
-            f"a window of {width} x {height} does not fit into this renderer's {size[0]} x {size[1]}; "
-            "make the renderer with a larger max_width and max_height"
-        )
+def check_square(intrinsics: Intrinsics) -> None:
+    """Raise SceneError for a window whose pixels are not square."""
     if abs(intrinsics.fx / intrinsics.fy - 1) > 1e-6:
         raise SceneError(
             f"focal lengths {intrinsics.fx} and {intrinsics.fy} differ; the mitsuba domain draws square pixels only, "

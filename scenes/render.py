@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cad.spatial import Intrinsics
 from scenes.camera import CAMERA
+from scenes.errors import SceneError
 from scenes.gl import mujoco
 
 What = Literal["rgb", "instances", "depth"]
@@ -63,6 +64,16 @@ class Renderer(Protocol):
     def close(self) -> None:
         """Free what the renderer holds; it cannot be used afterwards."""
         ...
+
+
+def check_window(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
+    """Raise SceneError for a window that is larger than ``size`` (width, height), which a renderer was made for."""
+    width, height = intrinsics.width, intrinsics.height
+    if width > size[0] or height > size[1]:
+        raise SceneError(
+            f"a window of {width} x {height} does not fit into this renderer's {size[0]} x {size[1]}; "
+            "make the renderer with a larger max_width and max_height"
+        )
 
 
 def instance_of_geom(model: mujoco.MjModel) -> NDArray[np.int16]:
