@@ -30,6 +30,8 @@ from scenes.stage import Stage, StageConfig
 from scenes.workers import one_core
 
 SIZE = 256
+PHYSICAL: tuple[Domain, ...] = ("filament", "mitsuba", "classic")
+"""Domains by what a scene is exported as: lamps with a place and a size, and surroundings, where they work."""
 SAMPLES, BOUNCES, THREADS = 64, 6, 2
 PART, PLACE_M, YAW = "main", (0.020, 0.0725), 0.6
 STANDALONE = Path(__file__).with_name("blender_scene.py")
@@ -91,7 +93,7 @@ class SharedScene:
 
     def export(self, folder: Path, images: int) -> None:
         """Write the scene, as a physically based domain has it, for ``blender_scene.py``."""
-        domain = next(d for d in ("filament", "mitsuba", "classic") if d == "classic" or not domain_problem(d))
+        domain = next(d for d in PHYSICAL if d == "classic" or not domain_problem(d))
         with closing(self.stage(domain)) as stage:
             _write_scene(SceneReader(stage.model).read(stage.data), stage, self._shot.intrinsics, images, folder)
 
