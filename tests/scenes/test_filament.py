@@ -237,6 +237,7 @@ def test_the_first_lamp_casts_shadows_where_it_should(plate):
 def test_a_larger_lamp_casts_softer_shadows(plate):
     fine = Intrinsics(width=256, height=256, fx=4 * BASLER.fx, fy=4 * BASLER.fy, cx=127.5, cy=127.5)
     widths = []
+    mujoco.mj_forward(plate.model, plate.data)
     for radius in (0.0, 0.05):
         plate.model.light_bulbradius[0] = radius
         row = plate.renderer.render(plate.data, fine, ("rgb",)).rgb[235, 128:250, 0]
