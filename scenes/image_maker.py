@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from cad.spatial import Array, Intrinsics, inverse
 from scenes.annotations import Labeller
 from scenes.bop import Annotation
-from scenes.dataset_config import DatasetConfig, Split
+from scenes.dataset_config import DatasetConfig, Kind
 from scenes.environments import make_environments
 from scenes.lens import Lens
 from scenes.randomize import draw_lens, draw_look, draw_sensor
+from scenes.ranges import Split
 from scenes.rests import RestPool
 from scenes.sensor import brightest, expose, mosaic_phase
 from scenes.shots import Shot, ShotSampler
@@ -24,6 +25,9 @@ from scenes.textures import make_textures, make_wear
 TEXTURES, ENVIRONMENTS, WORN_TAGS = 36, 12, 3
 STREAMS: dict[Split, int] = {"train": 101, "val": 202, "test": 303}
 """First word of every seed of a split: no two splits share a shot, a background or an environment."""
+
+SHADOWS: dict[Kind, tuple[float, int]] = {"crop": (0.025, 1024), "window": (0.07, 1024), "scene": (0.2, 4096)}
+"""Half the side, m, of the square that shadows are computed for, and the pixels of its map, at the usual sizes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,13 +113,16 @@ class ImageMaker:
 
 
 def stage_config(config: DatasetConfig) -> StageConfig:
-    """Slots, window size and shadow map for the images of a data set."""
-    size = config.pixels
+    """Slots, window size and shadow map for the images of a data set; larger windows are lit and shadowed farther."""
+    half_m, pixels = SHADOWS[config.kind]
+    if config.kind == "crop" and config.scale_down > 1:
+        pixels //= 2
+    while half_m < min(half_diagonal_m(config), SHADOWS["scene"][0]):
+        half_m, pixels = 2 * half_m, min(2 * pixels, SHADOWS["scene"][1])
     slots = config.shot_ranges.most_parts(config.kind)
-    if config.kind == "scene":
-        return StageConfig(slots=slots, max_size=size, shadow_half_m=0.2, shadow_size=4096)
-    if config.kind == "window":
-        return StageConfig(slots=slots, max_size=size, shadow_half_m=0.07, shadow_size=1024)
-    return StageConfig(
-        slots=slots, max_size=size, shadow_half_m=0.025, shadow_size=512 if config.scale_down > 1 else 1024
-    )
+    return StageConfig(slots=slots, max_size=config.pixels, shadow_half_m=half_m, shadow_size=pixels)
+
+
+def half_diagonal_m(config: DatasetConfig) -> float:
+    """How far the corners of the largest images are from their middles, on the board."""
+    return float(np.hypot(*config.pixels)) / 2 * config.view_ranges.height_m[1] / config.frame.fx
