@@ -122,7 +122,7 @@ class ChunkWriter:
             same = np.array_equal(annotation.silhouette, annotation.visible)
             self._write(f"mask_visib/{image:06d}_{k:06d}.png", encoded)
             self._write(f"mask/{image:06d}_{k:06d}.png", encoded if same else encode_png(whole))
-            info = _info(annotation, int(whole.sum() if units is None else np.count_nonzero(units[whole])))
+            info = _info(annotation, int(np.count_nonzero(whole if units is None else whole & (units > 0))))
             infos.append(info)
             if info["px_count_visib"]:
                 self._coco.add_part(
@@ -199,8 +199,10 @@ def check_part_size(part: Part) -> None:
 
 def depth_units(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """16-bit depth (H, W) in steps of DEPTH_SCALE mm; 0, which is no measurement, where it is too far to be told."""
-    units = np.rint(depth_m * np.float32(1e3 / DEPTH_SCALE))
-    return np.where(units < 65536, units, 0).astype(np.uint16)
+    units = depth_m * np.float32(1e3 / DEPTH_SCALE)
+    np.rint(units, out=units)
+    units[units >= 65536] = 0
+    return units.astype(np.uint16)
 
 
 def mask_box(mask: NDArray[np.bool_], corner: tuple[int, int] = (0, 0)) -> Box:
