@@ -19,7 +19,7 @@ from scenes.ranges import Split
 from scenes.rests import RestPool
 from scenes.sensor import brightest, expose, mosaic_phase
 from scenes.shots import Shot, ShotSampler
-from scenes.stage import Stage, StageConfig
+from scenes.stage import CONE, Stage, StageConfig
 from scenes.textures import make_textures, make_wear
 
 TEXTURES, ENVIRONMENTS, WORN_TAGS = 36, 12, 3
@@ -113,11 +113,15 @@ class ImageMaker:
 
 
 def stage_config(config: DatasetConfig) -> StageConfig:
-    """Slots, window size and shadow map for the images of a data set; larger windows are lit and shadowed farther."""
+    """Slots, window size and shadow map for the images of a data set; larger windows are lit and shadowed farther.
+
+    Shadows reach the corners, or what scenes usually have of them, and light always does.
+    """
     half_m, pixels = SHADOWS[config.kind]
     if config.kind == "crop" and config.scale_down > 1:
         pixels //= 2
-    while half_m < min(half_diagonal_m(config), SHADOWS["scene"][0]):
+    reach = half_diagonal_m(config)
+    while half_m < min(reach, max(SHADOWS["scene"][0], 1.1 * reach / CONE)):
         half_m, pixels = 2 * half_m, min(2 * pixels, SHADOWS["scene"][1])
     slots = config.shot_ranges.most_parts(config.kind)
     return StageConfig(slots=slots, max_size=config.pixels, shadow_half_m=half_m, shadow_size=pixels)

@@ -6,7 +6,7 @@ them the strength and the sharpness of highlights for the classic one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,13 +101,7 @@ def draw_look(
     environment = int(rng.integers(environments)) if environments else -1
     if rng.random() < ranges.default_look:
         level = float(rng.uniform(0.9, 1.1))
-        return Look(
-            lamps=DEFAULT_LAMPS,
-            ambient=DEFAULT_AMBIENT,
-            environment=environment,
-            board_rgb=(level, level, level),
-            default=True,
-        )
+        return replace(DEFAULT_LOOK, environment=environment, board_rgb=(level, level, level))
     textured = textures > 0 and rng.random() < ranges.texture_share
     level = rng.uniform(0.06, 0.35) if rng.random() < ranges.dark_board_share else rng.uniform(*ranges.board_level)
     worn_tags = worn > 0 and rng.random() < ranges.worn_share

@@ -6,6 +6,11 @@ import pytest
 from scenes.dataset_config import DatasetConfig
 from scenes.image_maker import SHADOWS, ImageMaker, half_diagonal_m, stage_config
 from scenes.ranges import LookRanges, SensorRanges, ViewRanges
+from scenes.stage import CONE
+
+
+def at(height_m):
+    return ViewRanges(height_m=(height_m, height_m))
 
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
@@ -30,7 +35,7 @@ def test_usual_sizes_have_the_usual_shadows(kind, settings, pixels, split):
         DatasetConfig(kind="crop", size=(1600, 1600)),
         DatasetConfig(kind="crop", size=(300, 300), downscale=4),
         DatasetConfig(kind="window", size=(640, 480)),
-        DatasetConfig(kind="window", view=ViewRanges(height_m=(1.2, 1.3))),
+        DatasetConfig(kind="window", view=at(1.3)),
     ],
 )
 def test_larger_windows_are_shadowed_to_their_corners_as_finely(config):
@@ -38,6 +43,14 @@ def test_larger_windows_are_shadowed_to_their_corners_as_finely(config):
     assert stage.shadow_half_m >= half_diagonal_m(config) > half_m
     coarser = 2 if config.kind == "crop" and config.scale_down > 1 else 1
     assert stage.shadow_half_m / stage.shadow_size == pytest.approx(coarser * half_m / pixels)
+
+
+@pytest.mark.parametrize("kind", ["crop", "window", "scene"])
+@pytest.mark.parametrize("height_m", [0.3, 0.7, 1.0, 1.3])
+def test_light_reaches_the_corners_of_the_largest_images(kind, height_m):
+    size = (5472, 3648) if kind == "scene" else (1368, 912)
+    config = DatasetConfig(kind=kind, size=size, downscale=None if kind == "scene" else 4, view=at(height_m))
+    assert CONE * stage_config(config).shadow_half_m > 1.05 * half_diagonal_m(config)
 
 
 @pytest.mark.parametrize("domain", ["classic", "filament"])
