@@ -214,13 +214,6 @@ def mask_box(mask: NDArray[np.bool_], corner: tuple[int, int] = (0, 0)) -> Box:
     return x + corner[0], y + corner[1], int(columns[-1]) - x, int(rows[-1]) - y
 
 
-def T_from_bop(R: Sequence[float], t_mm: Sequence[float]) -> Array:
-    """(4, 4) in metres from BOP's nine row-major rotation entries and translation in millimetres."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.reshape(R, (3, 3)), np.asarray(t_mm) / 1e3
-    return T
-
-
 def _camera(intrinsics: Intrinsics, T_cam_board: Array, distortion: ArrayLike, gamma: float) -> dict[str, Any]:
     camera = {
         "cam_K": intrinsics.matrix.ravel().tolist(),
