@@ -171,7 +171,7 @@ def _cached(data_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> K
             if str(stored["key"]) == key:
                 return kind(**{f.name: stored[f.name] for f in fields(kind)})
     loaded = read(data_dir)
-    aside = path.with_suffix(".part.npz")
+    aside = path.with_name(f".{os.getpid()}.{CACHE}")
     np.savez(aside, key=np.array(key), **{f.name: getattr(loaded, f.name) for f in fields(kind)})
     os.replace(aside, path)
     return loaded
