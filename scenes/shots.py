@@ -146,7 +146,9 @@ class ShotSampler:
         u, v = BASLER.project(apply(inverse(T_board_cam), [x, y, 0.0]))
         jitter = rng.integers(-ranges.centre_jitter_px, ranges.centre_jitter_px + 1, 2)
         width, height = size[0] * downscale, size[1] * downscale
-        corner = np.round([u, v]).astype(int) + jitter - np.array([width, height]) // 2
+        middle = np.round([u, v]).astype(int) + jitter
+        limits = np.array([BASLER.width - width, BASLER.height - height])
+        corner = np.clip(middle - np.array([width, height]) // 2, 0, limits)
         window = BASLER.crop(int(corner[0]), int(corner[1]), width, height).downscaled(downscale)
         for _ in range(rng.integers(*ranges.crop_crumbs, endpoint=True)):
             layout.add_crumb(*_place_in(window, T_board_cam, rng))

@@ -35,8 +35,8 @@ class Render:
     The images depend on the settings only, not on --jobs or --ray.
     """
 
-    recipe: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Settings by name; see `tagcell data recipes`."""
+    recipe: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
+    """Settings by name, see `tagcell data recipes`, or a file of your own, in which ranges can be changed, too."""
     kind: Annotated[Kind | None, arg(metavar="{crop,window,scene}", help_behavior_hint="(default: crop)")] = None
     """A window of the camera's frame round one part; one with any number of parts; or a whole frame."""
     part: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME", help_behavior_hint=PARTS_HINT)] = ()
@@ -85,7 +85,7 @@ class Render:
         from twin.render_progress import image_progress
 
         config = self.config()
-        out = self.out or Path("data") / (self.recipe or f"{config.kind}s")
+        out = self.out or Path("data") / (Path(self.recipe).stem if self.recipe else f"{config.kind}s")
         usual = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the workers, too
         try:
             with image_progress(out.name) as report:
