@@ -1,8 +1,4 @@
-"""The physically based renderer: labels as the classic one's, linear levels, changes at run time, missing drivers."""
-
-import os
-import subprocess
-import sys
+"""The physically based renderer: labels as the classic one's, linear levels, changes at run time."""
 
 import numpy as np
 import pytest
@@ -20,7 +16,6 @@ from scenes.gl import mujoco
 from scenes.look import add_material, add_raw_mesh, add_texture, add_visual
 from scenes.render import HIDDEN_GROUP
 from scenes.scene_export import WHITE_LUX
-from scenes.vulkan import INSTALL_VULKAN, vulkan_problem
 from scenes.workcell import CellConfig, build_board_scene, set_parts
 
 WINDOW = BASLER.crop(2672, 1760, 128, 128)
@@ -321,65 +316,3 @@ def test_a_closed_renderer_and_a_window_too_large_are_refused(plate):
     renderer.close()
     with pytest.raises(SceneError, match="closed"):
         renderer.render(plate.data, WINDOW.crop(0, 0, 8, 8))
-
-
-REFUSED = """
-import sys
-{before}
-from scenes.domains import domain_problem, make_renderer
-from scenes.errors import SceneError
-from scenes.gl import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco/>")
-try:
-    make_renderer("filament", model, max_width=8, max_height=8)
-except SceneError as error:
-    assert str(error) == domain_problem("filament")
-    print(error)
-"""
-
-
-WITHOUT_LOADER = """
-import ctypes
-load = ctypes.CDLL
-def without_vulkan(name, *rest, **more):
-    if "vulkan" in str(name):
-        raise OSError(name)
-    return load(name, *rest, **more)
-ctypes.CDLL = without_vulkan
-"""
-
-
-def refusal(before="", **environment):
-    """What a process of its own prints when it asks for Filament."""
-    done = subprocess.run(
-        [sys.executable, "-c", REFUSED.format(before=before)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_without_a_driver_the_command_that_mends_it_is_told():
-    message = refusal(VK_ICD_FILENAMES="/nonexistent", VK_DRIVER_FILES="/nonexistent")
-    assert message.startswith("cannot render the filament domain: no Vulkan")
-    assert message.endswith(f"run\n  {INSTALL_VULKAN}\n")
-
-
-def test_without_the_vulkan_loader_the_command_that_mends_it_is_told():
-    assert vulkan_problem("libvulkan-of-nowhere.so") == "the Vulkan loader libvulkan-of-nowhere.so is missing"
-    message = refusal(WITHOUT_LOADER)
-    assert "the Vulkan loader libvulkan.so.1 is missing" in message and INSTALL_VULKAN in message
-
-
-def test_a_mujoco_without_filament_is_told():
-    message = refusal("import scenes.gl\nsys.modules['mujoco.mjrf'] = None")
-    assert message.startswith("cannot render the filament domain: MuJoCo's Filament does not load")
-    assert "pip install" in message
-
-
-def test_nothing_is_written_to_standard_output():
-    before = "sys.argv = ['']"
-    assert refusal(before) == ""
