@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 from cad.spatial import Intrinsics
 from scenes.annotations import Labeller
-from scenes.bop import ChunkWriter
+from scenes.bop import ShardWriter
 from scenes.camera import CAMERA
 from scenes.dataset_config import DatasetConfig
 from scenes.dataset_folder import opened
@@ -42,8 +42,8 @@ _PATCHED: tuple[tuple[Any, str, str], ...] = (
     (Stage, "arrange", "arrange"),
     (Stage, "dress", "dress"),
     (Labeller, "label", "labels"),
-    (ChunkWriter, "add", "labels"),
-    (ChunkWriter, "finish", "labels"),
+    (ShardWriter, "add", "labels"),
+    (ShardWriter, "finish", "labels"),
     (Path, "write_bytes", "write"),
 )
 _PATCHED_NAMES = {

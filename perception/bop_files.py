@@ -1,7 +1,7 @@
 """Reads the files of a rendered data set: BOP layout, millimetres on disk, metres and OpenCV's camera in memory.
 
 A data set is a folder with ``dataset.json``, which says how it was made and which split it is, ``manifest.json``,
-which says that it is complete and how many images it has, and chunks of images ``SPLIT/NNNNNN/``. What would be read
+which says that it is complete and how many images it has, and shards of images ``SPLIT/NNNNNN/``. What would be read
 wrongly is refused: metres taken for millimetres, a lens that distorts, images that are missing.
 """
 
@@ -30,13 +30,13 @@ DIAMETER_MM = (0.5, 1e3)
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One image of a chunk and what its JSON files say about it.
+    """One image of a shard and what its JSON files say about it.
 
     ``instances`` are the entries of ``scene_gt.json`` of the parts of which something is seen, ``places`` their numbers
     among all parts of the image, which name their masks.
     """
 
-    chunk: Path
+    shard: Path
     image_id: int
     camera: dict[str, Any]
     instances: list[dict[str, Any]]
@@ -59,15 +59,15 @@ class Entry:
     def image(self) -> NDArray[np.uint8]:
         """Colours (H, W, 3) in the order red, green, blue, from a PNG or JPEG file."""
         for suffix in (".png", ".jpg"):
-            path = self.chunk / "rgb" / f"{self.image_id:06d}{suffix}"
+            path = self.shard / "rgb" / f"{self.image_id:06d}{suffix}"
             if path.exists():
                 return _read_image(path, cv2.IMREAD_COLOR)[..., ::-1]
-        raise PerceptionError(f"no image {self.image_id:06d}.png or .jpg in {self.chunk / 'rgb'}")
+        raise PerceptionError(f"no image {self.image_id:06d}.png or .jpg in {self.shard / 'rgb'}")
 
     def mask(self, instance: int) -> NDArray[np.bool_]:
         """Visible pixels (H, W) of one of the ``instances``."""
         name = f"{self.image_id:06d}_{self.places[instance]:06d}.png"
-        return _read_image(self.chunk / "mask_visib" / name, cv2.IMREAD_GRAYSCALE) > 0
+        return _read_image(self.shard / "mask_visib" / name, cv2.IMREAD_GRAYSCALE) > 0
 
     def _pose(self, entry: dict[str, Any], rotation: str, translation: str) -> Array:
         t_mm = np.asarray(entry[translation], np.float64)
@@ -75,7 +75,7 @@ class Entry:
         if not DISTANCE_MM[0] <= distance <= DISTANCE_MM[1]:
             unit = "metres" if distance < DISTANCE_MM[0] else "micrometres, or was scaled twice"
             raise PerceptionError(
-                f"image {self.image_id} of {self.chunk}: {translation} is {distance:g} mm long, outside "
+                f"image {self.image_id} of {self.shard}: {translation} is {distance:g} mm long, outside "
                 f"{DISTANCE_MM[0]:g} to {DISTANCE_MM[1]:g} mm; it seems to be in {unit}: BOP's unit is the millimetre"
             )
         return transform(np.reshape(entry[rotation], (3, 3)), t_mm / 1e3)
@@ -103,7 +103,7 @@ def read_entries(data_dir: Path) -> list[Entry]:
     _check_models(data_dir / "models" / "models_info.json")
     split = data_dir / dataset["split"]
     entries = [
-        entry for chunk in sorted(split.glob("*")) if re.fullmatch(r"\d{6}", chunk.name) for entry in _read(chunk)
+        entry for shard in sorted(split.glob("*")) if re.fullmatch(r"\d{6}", shard.name) for entry in _read(shard)
     ]
     if len(entries) != manifest["images"]:
         raise PerceptionError(
@@ -123,27 +123,27 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read(chunk: Path) -> list[Entry]:
+def _read(shard: Path) -> list[Entry]:
     cameras, truths, infos = (
-        read_json(chunk / f"{name}.json") for name in ("scene_camera", "scene_gt", "scene_gt_info")
+        read_json(shard / f"{name}.json") for name in ("scene_camera", "scene_gt", "scene_gt_info")
     )
     if not set(cameras) == set(truths) == set(infos):
         raise PerceptionError(
-            f"{chunk}: scene_camera.json has {len(cameras)} images, scene_gt.json {len(truths)}, scene_gt_info.json "
+            f"{shard}: scene_camera.json has {len(cameras)} images, scene_gt.json {len(truths)}, scene_gt_info.json "
             f"{len(infos)}"
         )
     entries = []
     for image in sorted(cameras, key=int):
         if np.any(cameras[image].get("cam_dist", 0.0)):
             raise PerceptionError(
-                f"image {image} of {chunk} was taken through a lens that distorts (cam_dist): render without distortion"
+                f"image {image} of {shard} was taken through a lens that distorts (cam_dist): render without distortion"
             )
         if any("stable_pose" not in truth for truth in truths[image]):
             raise PerceptionError(
-                f"image {image} of {chunk} has parts with no stable_pose: only data sets that Tagcell made can be read"
+                f"image {image} of {shard} has parts with no stable_pose: only data sets that Tagcell made can be read"
             )
         places = [k for k, info in enumerate(infos[image]) if info["px_count_visib"] > 0]
-        entries.append(Entry(chunk, int(image), cameras[image], [truths[image][k] for k in places], places))
+        entries.append(Entry(shard, int(image), cameras[image], [truths[image][k] for k in places], places))
     return entries
 
 

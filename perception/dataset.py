@@ -186,7 +186,7 @@ def _read_images(entries: Sequence[Entry]) -> NDArray[np.uint8]:
         for i, image in enumerate(images, start=1):
             if image.shape != first.shape:
                 raise PerceptionError(
-                    f"image {entries[i].image_id} of {entries[i].chunk} is {image.shape[1]} x {image.shape[0]}, the "
+                    f"image {entries[i].image_id} of {entries[i].shard} is {image.shape[1]} x {image.shape[0]}, the "
                     f"first one {first.shape[1]} x {first.shape[0]}: all must be of one size"
                 )
             out[i] = image
@@ -214,7 +214,7 @@ def _read_crops(data_dir: Path) -> CropSet:
 
 def _instance_map(entry: Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
     if len(entry.instances) > MAX_INSTANCES:
-        raise PerceptionError(f"image {entry.image_id} of {entry.chunk} has more than {MAX_INSTANCES} instances")
+        raise PerceptionError(f"image {entry.image_id} of {entry.shard} has more than {MAX_INSTANCES} instances")
     out = np.zeros(shape, np.uint8)
     for k in range(len(entry.instances)):
         out[entry.mask(k)] = k + 1

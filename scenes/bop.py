@@ -71,7 +71,7 @@ class Annotation:
         return out
 
 
-class ChunkWriter:
+class ShardWriter:
     """Writes the images of one folder as they come, and its JSON files with ``finish``.
 
     ``scene_id`` is the folder's number; ``jpeg`` the quality of the colour files, None for PNG. Raises SceneError when

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import cv2
 
-from scenes.bop import ChunkWriter
+from scenes.bop import ShardWriter
 from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
 from scenes.image_maker import ImageMaker
@@ -87,7 +87,7 @@ class ShardMaker:
         config = self._config
         try:
             with written_aside(shard_path(self._split, shard.index)) as folder:
-                writer = ChunkWriter(
+                writer = ShardWriter(
                     folder, shard.index, config.load_parts(), with_depth=config.depth, jpeg=config.jpeg
                 )
                 for index in range(shard.first, shard.first + shard.count):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics
-from scenes.bop import Annotation, ChunkWriter, write_models
+from scenes.bop import Annotation, ShardWriter, write_models
 
 
 @dataclass
@@ -31,8 +31,8 @@ def write_data_set(
     folder: Path, split: str, parts: Sequence[Part], pictures: Sequence[Picture], jpeg: int | None = None
 ) -> Path:
     """A finished data set of one shard."""
-    chunk = folder / split / "000000"
-    writer = ChunkWriter(chunk, 0, parts, with_depth=any(p.depth_m is not None for p in pictures), jpeg=jpeg)
+    shard = folder / split / "000000"
+    writer = ShardWriter(shard, 0, parts, with_depth=any(p.depth_m is not None for p in pictures), jpeg=jpeg)
     for p in pictures:
         writer.add(p.rgb, p.intrinsics, p.T_cam_board, p.annotations, p.depth_m, p.distortion)
     writer.finish()

@@ -165,12 +165,12 @@ def scaled(entry: dict[str, Any], key: str, factor: float) -> None:
 
 @pytest.mark.parametrize(("factor", "says"), [(1e-3, "seems to be in metres"), (1e3, "or was scaled twice")])
 def test_translations_in_another_unit_are_refused(split: Path, factor: float, says: str) -> None:
-    chunk = split / "val" / "000000"
-    edit(chunk / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", factor))
+    shard = split / "val" / "000000"
+    edit(shard / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", factor))
     with pytest.raises(PerceptionError, match=rf"image 2 of .*cam_t_m2c.*{says}: BOP's unit is the millimetre"):
         load_crops(split)
-    edit(chunk / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", 1 / factor))
-    edit(chunk / "scene_camera.json", lambda camera: scaled(camera["1"], "cam_t_w2c", factor))
+    edit(shard / "scene_gt.json", lambda truth: scaled(truth["2"][0], "cam_t_m2c", 1 / factor))
+    edit(shard / "scene_camera.json", lambda camera: scaled(camera["1"], "cam_t_w2c", factor))
     with pytest.raises(PerceptionError, match=rf"image 1 of .*cam_t_w2c.*{says}"):
         load_windows(split)
 
@@ -186,15 +186,15 @@ def test_models_in_another_unit_are_refused(split: Path, factor: float) -> None:
 
 
 def test_a_lens_that_distorts_and_foreign_labels_are_refused(split: Path) -> None:
-    chunk = split / "val" / "000000"
-    edit(chunk / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0, 0, 0, 0]))
+    shard = split / "val" / "000000"
+    edit(shard / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0, 0, 0, 0]))
     assert len(load_crops(split)) == 3
     (split / "cache.npz").unlink()
-    edit(chunk / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0.01, 0, 0, 0]))
+    edit(shard / "scene_camera.json", lambda camera: camera["0"].update(cam_dist=[0.01, 0, 0, 0]))
     with pytest.raises(PerceptionError, match=r"image 0 .*lens that distorts"):
         load_crops(split)
-    edit(chunk / "scene_camera.json", lambda camera: camera["0"].pop("cam_dist"))
-    edit(chunk / "scene_gt.json", lambda truth: truth["2"][0].pop("stable_pose"))
+    edit(shard / "scene_camera.json", lambda camera: camera["0"].pop("cam_dist"))
+    edit(shard / "scene_gt.json", lambda truth: truth["2"][0].pop("stable_pose"))
     with pytest.raises(PerceptionError, match=r"image 2 .*no stable_pose"):
         load_crops(split)
 

@@ -44,9 +44,9 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> WindowSet:
 def annotations_of(data_dir: Path, split: str) -> list[list[dict]]:
     """COCO annotations of every image, in order."""
     out = []
-    for chunk in sorted((data_dir / split).glob("[0-9]*")):
+    for shard in sorted((data_dir / split).glob("[0-9]*")):
         with contextlib.redirect_stdout(io.StringIO()):
-            coco = COCO(str(chunk / "scene_gt_coco.json"))
+            coco = COCO(str(shard / "scene_gt_coco.json"))
         out += [coco.imgToAnns[image] for image in sorted(coco.imgs)]
     return out
 

@@ -16,7 +16,7 @@ from pycocotools.coco import COCO
 from cad.equivalence import Axis, Symmetries, symmetries_from_json
 from cad.parts import load_mesh
 from cad.spatial import BASLER, rotation_x, rotation_z, transform
-from scenes.bop import DEPTH_SCALE, Annotation, ChunkWriter, depth_units, write_camera, write_models
+from scenes.bop import DEPTH_SCALE, Annotation, ShardWriter, depth_units, write_camera, write_models
 from scenes.coco import encode_runs, merged
 from scenes.errors import SceneError
 
@@ -76,7 +76,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def chunk(folder):
+def shard(folder):
     return folder / "test" / "000000"
 
 
@@ -91,7 +91,7 @@ def load_coco(content, tmp_path):
         return COCO(str(path))
 
 
-def test_the_folders_are_bops(folder, chunk):
+def test_the_folders_are_bops(folder, shard):
     assert sorted(path.name for path in (folder / "models").iterdir()) == [
         "keypoints.json",
         "models_info.json",
@@ -99,16 +99,16 @@ def test_the_folders_are_bops(folder, chunk):
         "obj_000005.ply",
     ]
     jsons = [f"{name}.json" for name in ("scene_camera", "scene_gt", "scene_gt_coco", "scene_gt_info")]
-    assert sorted(path.name for path in chunk.iterdir()) == sorted(["rgb", "depth", "mask", "mask_visib", *jsons])
+    assert sorted(path.name for path in shard.iterdir()) == sorted(["rgb", "depth", "mask", "mask_visib", *jsons])
     images = ["000000.png", "000001.png", "000002.png"]
     masks = ["000000_000000.png", "000000_000001.png", "000001_000000.png", "000001_000001.png"]
     for name, files in (("rgb", images), ("depth", images), ("mask", masks), ("mask_visib", masks)):
-        assert sorted(path.name for path in (chunk / name).iterdir()) == files
+        assert sorted(path.name for path in (shard / name).iterdir()) == files
 
 
-def test_the_entries_are_bops_in_millimetres(chunk):
-    cameras, truths = read(chunk / "scene_camera.json"), read(chunk / "scene_gt.json")
-    infos = read(chunk / "scene_gt_info.json")
+def test_the_entries_are_bops_in_millimetres(shard):
+    cameras, truths = read(shard / "scene_camera.json"), read(shard / "scene_gt.json")
+    infos = read(shard / "scene_gt_info.json")
     assert list(cameras) == list(truths) == list(infos) == ["0", "1", "2"]
     assert list(cameras["0"]) == ["cam_K", "depth_scale", "cam_R_w2c", "cam_t_w2c"]
     np.testing.assert_array_equal(np.reshape(cameras["0"]["cam_K"], (3, 3)), WINDOW.matrix)
@@ -124,17 +124,17 @@ def test_the_entries_are_bops_in_millimetres(chunk):
     }
 
 
-def test_distortion_and_gamma_are_told_only_where_there_is_any(chunk, tmp_path):
-    cameras = read(chunk / "scene_camera.json")
+def test_distortion_and_gamma_are_told_only_where_there_is_any(shard, tmp_path):
+    cameras = read(shard / "scene_camera.json")
     assert cameras["1"]["cam_dist"] == [-0.01, 0, 0, 0] and "cam_dist" not in cameras["2"]
-    writer = ChunkWriter(tmp_path / "000000", 0, PARTS)
+    writer = ShardWriter(tmp_path / "000000", 0, PARTS)
     writer.add(np.zeros((*SHAPE, 3), np.uint8), WINDOW, T_CAM_BOARD, [], gamma=0.45)
     writer.finish()
     assert read(tmp_path / "000000" / "scene_camera.json")["0"]["gamma"] == 0.45
 
 
-def test_boxes_and_counts_are_those_of_bops_toolkit(chunk):
-    first, second = (read(chunk / "scene_gt_info.json")[i] for i in "01")
+def test_boxes_and_counts_are_those_of_bops_toolkit(shard):
+    first, second = (read(shard / "scene_gt_info.json")[i] for i in "01")
     whole = int(ellipse(12, 16).sum())
     assert first[0]["bbox_obj"] == first[0]["bbox_visib"] == [4, 5, 13, 9]
     assert first[0]["visib_fract"] == 1.0
@@ -149,24 +149,24 @@ def test_boxes_and_counts_are_those_of_bops_toolkit(chunk):
     assert second[1]["px_count_all"] > 0 and second[1]["visib_fract"] == 0
 
 
-def test_masks_are_of_zero_and_255_and_show_whole_and_visible(chunk):
+def test_masks_are_of_zero_and_255_and_show_whole_and_visible(shard):
     for image, picture in enumerate(pictures()):
         for k, a in enumerate(picture.annotations):
             name = f"{image:06d}_{k:06d}.png"
             whole, visible = (
-                cv2.imread(str(chunk / kind / name), cv2.IMREAD_UNCHANGED) for kind in ("mask", "mask_visib")
+                cv2.imread(str(shard / kind / name), cv2.IMREAD_UNCHANGED) for kind in ("mask", "mask_visib")
             )
             assert whole.dtype == np.uint8 and whole.shape == SHAPE and set(np.unique(whole)) == {0, 255}
             assert np.array_equal(whole > 0, a.mask(SHAPE)) and np.array_equal(visible > 0, a.mask_visible(SHAPE))
-    half = cv2.imread(str(chunk / "mask" / "000000_000001.png"), cv2.IMREAD_UNCHANGED) > 0
+    half = cv2.imread(str(shard / "mask" / "000000_000001.png"), cv2.IMREAD_UNCHANGED) > 0
     assert np.array_equal(half[20:32, 30:46], ellipse(12, 16)) and half.sum() == ellipse(12, 16).sum()
 
 
-def test_images_and_depth_come_back(chunk):
+def test_images_and_depth_come_back(shard):
     for image, picture in enumerate(pictures()):
-        stored = cv2.imread(str(chunk / "rgb" / f"{image:06d}.png"))[..., ::-1]
+        stored = cv2.imread(str(shard / "rgb" / f"{image:06d}.png"))[..., ::-1]
         assert np.array_equal(stored, picture.rgb)
-        depth = cv2.imread(str(chunk / "depth" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
+        depth = cv2.imread(str(shard / "depth" / f"{image:06d}.png"), cv2.IMREAD_UNCHANGED)
         assert depth.dtype == np.uint16 and not depth[:2].any()
         np.testing.assert_allclose(depth[2:] * DEPTH_SCALE, 700.0, atol=DEPTH_SCALE / 2 + 1e-4)
     levels = np.linspace(0.3, 1.31, 5000, dtype=np.float32)
@@ -182,20 +182,20 @@ def test_jpeg_files_take_the_place_of_png(tmp_path):
     assert read(folder / "train" / "000000" / "scene_gt_coco.json")["images"][0]["file_name"] == "rgb/000000.jpg"
 
 
-def test_coco_files_load_and_say_what_bops_say(chunk, tmp_path):
-    coco = load_coco(read(chunk / "scene_gt_coco.json"), tmp_path)
-    infos = read(chunk / "scene_gt_info.json")
+def test_coco_files_load_and_say_what_bops_say(shard, tmp_path):
+    coco = load_coco(read(shard / "scene_gt_coco.json"), tmp_path)
+    infos = read(shard / "scene_gt_info.json")
     assert len(coco.imgs) == 3 and len(coco.anns) == 3  # what nothing is seen of is left out
     assert {c["id"]: c["name"] for c in coco.cats.values()} == {1: "block", 5: "bar"}
     assert coco.cats[5]["keypoints"] == [f"bar_{k}" for k in range(8)]
     for a in coco.anns.values():
         image = coco.imgs[a["image_id"]]
-        assert (image["width"], image["height"]) == (SHAPE[1], SHAPE[0]) and (chunk / image["file_name"]).exists()
+        assert (image["width"], image["height"]) == (SHAPE[1], SHAPE[0]) and (shard / image["file_name"]).exists()
         number = int(image["file_name"][4:10])
         name, info = f"{number:06d}_{a['gt_id']:06d}.png", infos[str(number)][a["gt_id"]]
-        assert np.array_equal(coco.annToMask(a), cv2.imread(str(chunk / "mask_visib" / name), 0) // 255)
+        assert np.array_equal(coco.annToMask(a), cv2.imread(str(shard / "mask_visib" / name), 0) // 255)
         assert a["area"] == info["px_count_visib"] and a["visib_fract"] == info["visib_fract"]
-        whole = cv2.imread(str(chunk / "mask" / name), 0)
+        whole = cv2.imread(str(shard / "mask" / name), 0)
         assert a["bbox"] == run_lengths.toBbox(run_lengths.encode(np.asfortranarray(whole // 255))).tolist()
         assert a["iscrowd"] == 0 and a["num_keypoints"] == 8
         np.testing.assert_allclose(np.reshape(a["keypoints"], (8, 3))[3], [3.25, 6.0, 1])
@@ -214,15 +214,15 @@ def test_run_lengths_are_pycocotools_own():
 
 
 def test_ids_stay_unique_when_folders_are_merged(tmp_path):
-    chunks = []
+    shards = []
     for scene_id in (0, 7, 8):
-        chunk = tmp_path / "train" / f"{scene_id:06d}"
-        writer = ChunkWriter(chunk, scene_id, PARTS)
+        shard = tmp_path / "train" / f"{scene_id:06d}"
+        writer = ShardWriter(shard, scene_id, PARTS)
         for p in pictures():
             writer.add(p.rgb, p.intrinsics, p.T_cam_board, p.annotations)
         writer.finish()
-        chunks.append(chunk)
-    coco = load_coco(merged(chunks, [read(chunk / "scene_gt_coco.json") for chunk in chunks]), tmp_path)
+        shards.append(shard)
+    coco = load_coco(merged(shards, [read(shard / "scene_gt_coco.json") for shard in shards]), tmp_path)
     assert len(coco.imgs) == 9 and len(coco.anns) == 9 and 0 not in coco.anns
     for a in coco.anns.values():
         assert (tmp_path / "train" / coco.imgs[a["image_id"]]["file_name"]).exists()
@@ -270,15 +270,15 @@ def test_the_cameras_file_is_bops(tmp_path):
 def test_what_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SceneError, match=r"cannot write into .*file"):
-        ChunkWriter(tmp_path / "file", 0, PARTS)
-    writer = ChunkWriter(tmp_path / "000000", 0, PARTS)
+        ShardWriter(tmp_path / "file", 0, PARTS)
+    writer = ShardWriter(tmp_path / "000000", 0, PARTS)
     (tmp_path / "000000" / "rgb").rmdir()
     with pytest.raises(SceneError, match=r"cannot write .*rgb/000000\.png"):
         writer.add(np.zeros((*SHAPE, 3), np.uint8), WINDOW, T_CAM_BOARD, [])
 
 
 def test_a_folder_takes_a_thousand_images_and_no_more(tmp_path):
-    writer = ChunkWriter(tmp_path / "000000", 0, PARTS)
+    writer = ShardWriter(tmp_path / "000000", 0, PARTS)
     small = BASLER.crop(0, 0, 2, 2)
     for _ in range(1000):
         writer.add(np.zeros((2, 2, 3), np.uint8), small, T_CAM_BOARD, [])

@@ -33,9 +33,9 @@ def foreign(ours):
     """The same as anybody's BOP data set: without our files and keys."""
     for name in ("dataset.json", "manifest.json", "camera.json", "rests.npz", "models/keypoints.json"):
         (ours / name).unlink()
-    for chunk in ours.glob("test/*"):
-        (chunk / "SHA256SUMS").unlink()
-        edit(chunk / "scene_gt.json", each(lambda entry: entry.pop("stable_pose")))
+    for shard in ours.glob("test/*"):
+        (shard / "SHA256SUMS").unlink()
+        edit(shard / "scene_gt.json", each(lambda entry: entry.pop("stable_pose")))
     return ours
 
 
@@ -66,12 +66,12 @@ def told(folder, sample=0):
 
 def a_part(folder):
     """Folder, image id and number of a part that is well visible, and the file name of its masks."""
-    for chunk in sorted(folder.glob("test/*")):
-        for image, infos in json.loads((chunk / "scene_gt_info.json").read_text()).items():
+    for shard in sorted(folder.glob("test/*")):
+        for image, infos in json.loads((shard / "scene_gt_info.json").read_text()).items():
             for k, info in enumerate(infos):
                 (x, y, w, h), visible = info["bbox_obj"], info["visib_fract"] == 1
                 if visible and min(x, y) > 10 and max(x + w, y + h) < 310 and info["px_count_all"] > 400:
-                    return chunk, image, k, f"{int(image):06d}_{k:06d}.png"
+                    return shard, image, k, f"{int(image):06d}_{k:06d}.png"
     raise AssertionError("no part is well visible")
 
 
@@ -87,11 +87,11 @@ def test_nothing_is_wrong_with_what_was_generated(made):
 
 def test_foreign_data_sets_are_checked_too(foreign):
     assert told(foreign, 4) == ""
-    for chunk in foreign.glob("test/*"):
+    for shard in foreign.glob("test/*"):
         for name in ("scene_gt_coco.json", "scene_gt_info.json"):
-            (chunk / name).unlink()
-        shutil.rmtree(chunk / "mask")
-        shutil.rmtree(chunk / "depth")
+            (shard / name).unlink()
+        shutil.rmtree(shard / "mask")
+        shutil.rmtree(shard / "depth")
     assert told(foreign, 4) == ""
     edit(foreign / "test" / "000001" / "scene_gt.json", scaled("cam_t_m2c", 1e-3))
     assert "seems to be in metres; write translations in millimetres" in told(foreign)
@@ -137,9 +137,9 @@ def test_unfinished_and_rearranged_sets_are_found(ours):
 
 
 def test_a_shard_that_was_made_anew_is_found(ours):
-    chunk = ours / "test" / "000000"
-    (chunk / "scene_gt.json").write_text((chunk / "scene_gt.json").read_text() + "\n")
-    write_sums(chunk)
+    shard = ours / "test" / "000000"
+    (shard / "scene_gt.json").write_text((shard / "scene_gt.json").read_text() + "\n")
+    write_sums(shard)
     assert "test/000000: SHA256SUMS is not the one that manifest.json lists" in told(ours)
 
 
@@ -155,8 +155,8 @@ def test_a_shard_that_was_made_anew_is_found(ours):
     ],
 )
 def test_wrong_units_are_found(foreign, name, key, factor, says):
-    for chunk in foreign.glob("test/*"):
-        edit(chunk / f"{name}.json", scaled(key, factor))
+    for shard in foreign.glob("test/*"):
+        edit(shard / f"{name}.json", scaled(key, factor))
     assert says in told(foreign, 2)
 
 
@@ -222,13 +222,13 @@ def test_entries_are_checked(foreign, name, change, says):
 
 
 def test_lengths_and_images_must_agree(foreign):
-    chunk = foreign / "test" / "000000"
-    edit(chunk / "scene_gt.json", lambda content: content.pop("1"))
-    edit(chunk / "scene_gt_info.json", lambda content: content["0"].append(content["0"][0] if content["0"] else {}))
+    shard = foreign / "test" / "000000"
+    edit(shard / "scene_gt.json", lambda content: content.pop("1"))
+    edit(shard / "scene_gt_info.json", lambda content: content["0"].append(content["0"][0] if content["0"] else {}))
     found = told(foreign)
     assert "scene_gt.json, image 1: has no entry for an image that others have" in found
     assert "scene_gt_info.json, image 0: is not the facts of the" in found
-    (chunk / "scene_camera.json").write_text("[")
+    (shard / "scene_camera.json").write_text("[")
     assert "scene_camera.json: cannot be read" in told(foreign, 4)
 
 
@@ -258,46 +258,46 @@ def test_coco_files_are_checked(ours, change, says):
 
 
 def test_masks_that_are_not_the_labels_are_found(foreign):
-    chunk, image, _, name = a_part(foreign)
-    path = chunk / "mask_visib" / name
+    shard, image, _, name = a_part(foreign)
+    path = shard / "mask_visib" / name
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     moved = np.roll(mask, 6, axis=1)
     cv2.imwrite(str(path), moved)
     found = told(foreign, 4)
     assert f"mask_visib/{name}, image {image}: shows" in found and "pixels that mask/ does not" in found
     assert "its runs are not mask_visib" in found and "bbox_visib" in found
-    cv2.imwrite(str(chunk / "mask" / name), moved)
+    cv2.imwrite(str(shard / "mask" / name), moved)
     assert f"mask/{name}, image {image}: object" in told(foreign, 4)
     cv2.imwrite(str(path), mask // 255)
     assert "not 8 bits of 0 and 255" in told(foreign, 4)
 
 
 def test_depth_and_images_that_are_not_the_labels_are_found(foreign):
-    chunk, image, _, _ = a_part(foreign)
-    path = chunk / "depth" / f"{int(image):06d}.png"
+    shard, image, _, _ = a_part(foreign)
+    path = shard / "depth" / f"{int(image):06d}.png"
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(path), depth + np.uint16(50))  # one millimetre
     found = told(foreign, 4)
     assert "is +1.0" in found and "mm from where its pose has it; write depth again" in found
     cv2.imwrite(str(path), (depth >> 8).astype(np.uint8))
     assert "not 16 bits of (320, 320)" in told(foreign, 4)
-    path = chunk / "rgb" / f"{int(image):06d}.png"
+    path = shard / "rgb" / f"{int(image):06d}.png"
     path.write_bytes(b"no image")
     assert f"rgb/{path.name}, image {image}: is no image that can be read" in told(foreign, 4)
 
 
 def test_a_pose_in_another_frame_is_found(foreign):
-    for chunk in foreign.glob("test/*"):
+    for shard in foreign.glob("test/*"):
         edit(
-            chunk / "scene_gt.json",
+            shard / "scene_gt.json",
             each(lambda e: e.update(cam_R_m2c=np.reshape(e["cam_R_m2c"], (3, 3)).T.ravel().tolist())),
         )
     assert "check unit, direction and frame of the poses" in told(foreign, 4)
 
 
 def test_many_like_problems_are_gathered(foreign):
-    for chunk in foreign.glob("test/*"):
-        edit(chunk / "scene_gt.json", scaled("cam_t_m2c", 1e-3))
+    for shard in foreign.glob("test/*"):
+        edit(shard / "scene_gt.json", scaled("cam_t_m2c", 1e-3))
     report = validate(foreign, sample=0)
     assert len([p for p in report.problems if p.file.endswith("scene_gt.json")]) <= 12
     assert any("more problems like the last" in p.what for p in report.problems)
