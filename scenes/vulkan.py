@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import ctypes
 
-INSTALL_VULKAN = "apt-get install -y libvulkan1 mesa-vulkan-drivers"
+VULKAN_PACKAGES = ("libvulkan1", "mesa-vulkan-drivers")
+"""Debian packages of the loader and of a driver that needs no GPU."""
+INSTALL_VULKAN = f"apt-get install -y {' '.join(VULKAN_PACKAGES)}"
 _STRUCTURE_TYPE_INSTANCE_CREATE_INFO = 1
 _SUCCESS = 0
 

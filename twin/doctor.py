@@ -10,15 +10,14 @@ import sys
 from importlib import metadata
 
 from scenes.photoreal import mitsuba_hint
+from scenes.vulkan import VULKAN_PACKAGES
 from twin.robot import TwinError
 
 GL_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
-VULKAN_PACKAGES = ("libvulkan1", "mesa-vulkan-drivers")
-_DOMAINS = ("classic", "filament", "mitsuba")
-_PROBES = {
+_PROBES = {"classic": "from scenes.gl import make_context; make_context(8, 8)"} | {
     domain: f"from scenes.domains import domain_problem; print(domain_problem({domain!r}), end='')"
-    for domain in _DOMAINS
-} | {"classic": "from scenes.gl import make_context; make_context(8, 8)"}
+    for domain in ("filament", "mitsuba")
+}
 
 
 def domain_state(domain: str) -> str:
@@ -58,7 +57,7 @@ def doctor(fix: bool = False) -> dict[str, str]:
     Raises TwinError when nothing can be rendered, with the command that mends it. The other domains are optional:
     their lines in the report say what they need.
     """
-    problems = {domain: domain_state(domain) for domain in _DOMAINS}
+    problems = {domain: domain_state(domain) for domain in _PROBES}
     if problems["classic"] and fix:
         install(GL_PACKAGES, "rendering without a screen")
         problems["classic"] = domain_state("classic")

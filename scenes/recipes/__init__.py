@@ -48,7 +48,7 @@ def load_recipe(name: str) -> DatasetConfig:
     """The config of a recipe; raises SceneError where there is none or it does not make one."""
     said = {key: value for key, value in recipe(name).items() if key != ABOUT}
     _refuse_unknown(f"recipe {name}", said, DatasetConfig)
-    split = said.get("split", "train")
+    split = said.get("split", DatasetConfig.split)
     bases = {
         "look": LOOKS,
         "shots": SHOTS,

@@ -6,27 +6,15 @@ import pytest
 from drawn_shots import SCENE, footprint, frames, shots
 from scipy.stats import binom
 
-from cad.parts import load_part, part_names
 from cad.resting import nearest_rest
 from cad.spatial import BASLER, Intrinsics, apply, inverse, transform
 from scenes.cell_config import CellConfig
 from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
 from scenes.ranges import TEST_VIEW, TRAIN_VIEW
-from scenes.rests import RestPool
 from scenes.shots import SHOTS, TEST_SHOTS, TRAIN_SHOTS, ShotRanges, ShotSampler, board_point
 
 CELL = CellConfig()
-
-
-@pytest.fixture(scope="module")
-def parts():
-    return {name: load_part(name) for name in part_names()}
-
-
-@pytest.fixture(scope="module")
-def pool(parts):
-    return RestPool.make(list(parts.values()))
 
 
 @pytest.fixture(scope="module")

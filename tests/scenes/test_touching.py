@@ -7,12 +7,11 @@ import pytest
 from drawn_shots import footprint, frames, shots
 
 from cad.collision import contact_pieces
-from cad.parts import load_part, part_names, planar
+from cad.parts import planar
 from cad.spatial import inverse, transform
 from scenes.cell_config import CellConfig
 from scenes.distractors import distractors
 from scenes.gl import mujoco
-from scenes.rests import RestPool
 from scenes.shots import TEST_SHOTS, TRAIN_SHOTS, ShotSampler
 from scenes.touching import TOUCH_M, Slider
 from scenes.workcell import build_board_scene, part_body, set_parts
@@ -21,16 +20,6 @@ CELL = CellConfig()
 TOUCHING = replace(
     TEST_SHOTS, touching=1.0, close=0.0, neighbours=(0.0, 1.0), crop_distractors=(1.0,), crop_crumbs=(0, 0)
 )
-
-
-@pytest.fixture(scope="module")
-def parts():
-    return {name: load_part(name) for name in part_names()}
-
-
-@pytest.fixture(scope="module")
-def pool(parts):
-    return RestPool.make(list(parts.values()))
 
 
 @pytest.fixture(scope="module")
