@@ -159,6 +159,18 @@ class Intrinsics:
             cy=(self.cy + 0.5) / factor - 0.5,
         )
 
+    def resampled(self, width: int, height: int) -> Intrinsics:
+        """The camera that sees the same with ``width`` x ``height`` pixels."""
+        u, v = width / self.width, height / self.height
+        return Intrinsics(
+            width=width,
+            height=height,
+            fx=self.fx * u,
+            fy=self.fy * v,
+            cx=(self.cx + 0.5) * u - 0.5,
+            cy=(self.cy + 0.5) * v - 0.5,
+        )
+
 
 BASLER_PIXEL_M = 2.4e-6
 """Pixel pitch of the Basler acA5472-17uc (Sony IMX183), Basler product page."""

@@ -14,11 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from cad.spatial import Array
+from perception.shadows import shadow
 
 CROP = 128
 """Width of a crop in pixels (half the camera's resolution)."""
 
 CROP_CENTRE = (CROP - 1) / 2
+SHADOWED = 0.2
+"""Share of the crops over which something casts a shadow from outside."""
 
 
 def image_turn(angle: float) -> Array:
@@ -64,7 +67,7 @@ def network_input(images: NDArray[np.uint8], rays: NDArray[np.floating]) -> Tens
 
 
 class Photometric:
-    """Network input with gain, tint, offset, grey, negative, shading, noise and blur varied.
+    """Network input with gain, tint, offset, grey, negative, shading, shadows, noise and blur varied.
 
     Noise is read from a table at a random place: drawing it anew would cost more than the network's first stage.
     """
@@ -84,6 +87,8 @@ class Photometric:
             c = image.astype(np.float32)
             for ramp in ramps:
                 c = cv2.scaleAdd(ramp, float(rng.normal(0.0, 0.15)) * deviation, c)
+            if rng.random() < SHADOWED:
+                c *= shadow(height, width, rng)[..., None]
             if rng.random() < 0.5:
                 start = int(rng.integers(len(self.noise) - c.size))
                 noise = self.noise[start : start + c.size].reshape(c.shape)

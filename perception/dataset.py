@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cad.parts import Part
 from cad.resting import as_rest
 from cad.spatial import Array, apply, inverse, yaw_of
-from perception.bop_files import Entry, manifest_hash, read_entries
+from perception.bop_files import DATASET, Entry, manifest_hash, read_entries, read_json
 from perception.calibration import table_from_board
 from perception.estimates import PerceptionError
 
@@ -44,7 +44,7 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropSet:
-    """N crops, each with at most one target part, the first of its list.
+    """N crops, each with at most one target part, the first of its list; none in a set whose ``target_share`` is 0.
 
     Where there is none, or nothing is seen of it, ``obj_id`` is 0 and the pose the identity.
     """
@@ -151,17 +151,30 @@ def resting_poses(
     )
 
 
-def load_crops(data_dir: Path) -> CropSet:
-    """All crops of a data set, from the cache beside it when that is of the same manifest."""
-    return _cached(data_dir, CropSet, _read_crops)
+def load_crops(*data_dirs: Path) -> CropSet:
+    """All crops of some data sets, one after the other, each from the cache beside it when that is of its manifest."""
+    return _joined([_cached(path, CropSet, _read_crops) for path in data_dirs])
 
 
-def load_windows(data_dir: Path) -> WindowSet:
-    """All windows or frames of a data set, from the cache beside it when that is of the same manifest."""
-    return _cached(data_dir, WindowSet, _read_windows)
+def load_windows(*data_dirs: Path) -> WindowSet:
+    """All windows or frames of some data sets, one after the other; see :func:`load_crops`."""
+    sets = [_cached(path, WindowSet, _read_windows) for path in data_dirs]
+    starts = np.cumsum([0, *map(len, sets)])
+    moved = [replace(s, image_index=s.image_index + start) for s, start in zip(sets, starts[:-1], strict=True)]
+    return _joined(moved)
 
 
 Kind = TypeVar("Kind", CropSet, WindowSet)
+
+
+def _joined(sets: Sequence[Kind]) -> Kind:
+    if len(sets) == 1:
+        return sets[0]
+    sizes = {s.images.shape[1:] for s in sets}
+    if len(sizes) != 1:
+        raise PerceptionError(f"data sets of images of shapes {sorted(sizes)}: give one or more of one size")
+    kind = type(sets[0])
+    return kind(**{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(kind)})
 
 
 def _cached(data_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> Kind:
@@ -196,7 +209,8 @@ def _read_images(entries: Sequence[Entry]) -> NDArray[np.uint8]:
 def _read_crops(data_dir: Path) -> CropSet:
     entries = read_entries(data_dir)
     images = _read_images(entries)
-    targets = [e.instances[0] if e.places[:1] == [0] else None for e in entries]
+    aimless = read_json(data_dir / DATASET).get("shots", {}).get("target_share") == 0
+    targets = [e.instances[0] if e.places[:1] == [0] and not aimless else None for e in entries]
     empty = np.zeros(images.shape[1:3], bool)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         masks = pool.map(lambda e, t: np.packbits(e.mask(0) if t else empty, axis=-1), entries, targets)

@@ -25,6 +25,7 @@ from perception.pnp import PnpError, solve_pnp
 from perception.posenets import PoseNets
 from perception.segmentation import Detection, Segmenter
 from perception.silhouette import silhouette_mask
+from perception.standard_view import frame_scale, standard_crop
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The weights that come with the package."""
@@ -107,10 +108,11 @@ class LearnedEstimator:
         seconds["tags"] = time.perf_counter() - started
 
         started = time.perf_counter()
-        detections = self.segmenter.detect(frame)
+        scale = frame_scale(frame.intrinsics, T_cam_table)
+        detections = self.segmenter.detect(frame, scale)
         seconds["segmentation"] = time.perf_counter() - started
 
-        crops, intrinsics = cut_crops(frame, detections)
+        crops, intrinsics = cut_crops(frame, detections, scale)
         solved = self.solver.solve(crops, intrinsics, [T_cam_table] * len(crops), seconds)
 
         started = time.perf_counter()
@@ -195,18 +197,16 @@ def _raw_pose(winner: Candidate, small: Intrinsics) -> Array | None:
         return None
 
 
-def cut_crops(frame: Frame, detections: Sequence[Detection]) -> tuple[NDArray[np.uint8], list[Intrinsics]]:
-    """Windows (N, 256, 256, 3) of the frame round the detections, kept inside of it, and their intrinsics."""
-    height, width = frame.image.shape[:2]
-    if min(height, width) < CROP_PX:
-        raise PerceptionError(f"a frame of {width} x {height} pixels is too small; crops have {CROP_PX} x {CROP_PX}")
-    crops, intrinsics = np.empty((len(detections), CROP_PX, CROP_PX, 3), np.uint8), []
-    for i, detection in enumerate(detections):
-        corner = np.round(detection.centre_px).astype(int) - CROP_PX // 2
-        u, v = (int(c) for c in np.clip(corner, 0, [width - CROP_PX, height - CROP_PX]))
-        crops[i] = frame.image[v : v + CROP_PX, u : u + CROP_PX]
-        intrinsics.append(frame.intrinsics.crop(u, v, CROP_PX, CROP_PX))
-    return crops, intrinsics
+def cut_crops(
+    frame: Frame, detections: Sequence[Detection], scale: float = 1.0
+) -> tuple[NDArray[np.uint8], list[Intrinsics]]:
+    """Windows (N, 256, 256, 3) of the frame round the detections at the standard scale, and their intrinsics.
+
+    ``scale`` is the frame's (see :func:`perception.standard_view.frame_scale`).
+    """
+    cut = [standard_crop(frame.image, frame.intrinsics, d.centre_px, CROP_PX, scale) for d in detections]
+    crops = np.stack([crop for crop, _ in cut]) if cut else np.empty((0, CROP_PX, CROP_PX, 3), np.uint8)
+    return crops, [intrinsics for _, intrinsics in cut]
 
 
 def drop_repeated(parts: Sequence[PartEstimate], overlap: float) -> list[PartEstimate]:

@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from cad.spatial import Array
 from perception.estimates import Frame, PerceptionError
+from perception.standard_view import reduced
 from perception.training import default_device, load_weights
 
 REDUCTION = 4
@@ -45,7 +46,7 @@ class Detection:
 
     ``centre_px`` (2,) is in pixels of the frame, the point above the footprint's centre at half the part's height.
     ``class_probabilities`` (P,) is in the order of the segmenter's ``part_names``. ``mask`` (h, w) bool covers the
-    pixels of the frame reduced by 4 from ``mask_origin`` (u, v) on.
+    pixels of the reduced frame from ``mask_origin`` (u, v) on; one of them is ``reduction`` (u, v) pixels of the frame.
     """
 
     centre_px: Array
@@ -53,6 +54,7 @@ class Detection:
     class_probabilities: Array
     mask: NDArray[np.bool_]
     mask_origin: tuple[int, int]
+    reduction: tuple[float, float] = (REDUCTION, REDUCTION)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,15 +114,19 @@ class Outputs:
 
 
 class SegmentationNet(nn.Module):
-    """Encoder to stride 16, decoder back to stride 2 with a skip at each stage, 0.5 M parameters."""
+    """Encoder to stride 16, decoder back to stride 2 with a skip at each stage; ``shape`` tells how to build it again.
 
-    def __init__(self, n_parts: int, widths: Sequence[int] = (16, 32, 48, 96)) -> None:
+    ``widths`` are the channels at the four strides, ``residuals`` the blocks at the last; 1.1 M parameters.
+    """
+
+    def __init__(self, n_parts: int, widths: Sequence[int] = (16, 32, 64, 128), residuals: int = 3) -> None:
         super().__init__()
         a, b, c, d = widths
+        self.shape = {"widths": list(widths), "residuals": residuals}
         self.stage2 = _convolution(3, a, stride=2, kernel=5)
         self.stage4 = nn.Sequential(_convolution(a, b, stride=2), _convolution(b, b))
         self.stage8 = nn.Sequential(_convolution(b, c, stride=2), _Residual(c))
-        self.stage16 = nn.Sequential(_convolution(c, d, stride=2), _Residual(d), _Residual(d))
+        self.stage16 = nn.Sequential(_convolution(c, d, stride=2), *(_Residual(d) for _ in range(residuals)))
         self.to8 = _convolution(d, c, kernel=1)
         self.at8 = _convolution(c, c)
         self.to4 = _convolution(c, b, kernel=1)
@@ -162,7 +168,12 @@ def reduced_autocast(device: torch.device) -> contextlib.AbstractContextManager[
     return torch.autocast(device.type, torch.bfloat16)
 
 
-def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = REDUCTION) -> list[Detection]:
+def decode(
+    outputs: Outputs,
+    index: int,
+    config: DecodeConfig,
+    reduction: tuple[float, float] = (REDUCTION, REDUCTION),
+) -> list[Detection]:
     """Instances of image ``index`` of a batch, best first."""
     heat = outputs.heat[index].sigmoid()
     # Peaks are local maxima over 5 x 5 heat cells, 5 mm: parts at rest beside each other have centres further apart.
@@ -203,11 +214,12 @@ def decode(outputs: Outputs, index: int, config: DecodeConfig, reduction: int = 
         centre = np.median(votes[mine][inside], axis=0).astype(np.float64)
         found.append(
             Detection(
-                centre_px=(centre + 0.5) * reduction - 0.5,
+                centre_px=(centre + 0.5) * np.array(reduction) - 0.5,
                 score=score,
                 class_probabilities=classes.astype(np.float64),
                 mask=blob,
                 mask_origin=origin,
+                reduction=reduction,
             )
         )
     return sorted(found, key=lambda detection: -detection.score)
@@ -242,25 +254,29 @@ class Segmenter:
         path = weights_dir / WEIGHTS
         state, metadata = load_weights(path, parts_dir)
         names = list(metadata["parts"])
-        net = SegmentationNet(len(names))
         try:
+            net = SegmentationNet(len(names), **metadata["net"])
             net.load_state_dict(state)
-        except RuntimeError as error:
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise PerceptionError(f"{path} holds another network than this version's; train again") from error
         return cls(net, names, DecodeConfig(**metadata.get("decode", {})))
 
-    def detect(self, frame: Frame) -> list[Detection]:
-        """The parts in a frame, best first, those cut by the image's border included."""
-        height, width = (size // REDUCTION for size in frame.image.shape[:2])
-        if min(height, width) < NETWORK_STRIDE:
-            raise PerceptionError(
-                f"a frame of {frame.image.shape[1]} x {frame.image.shape[0]} pixels is too small; at least "
-                f"{REDUCTION * NETWORK_STRIDE} on each side are needed"
-            )
-        image = frame.image[: height * REDUCTION, : width * REDUCTION]
-        return self.detect_reduced(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8))
+    def detect(self, frame: Frame, scale: float = 1.0) -> list[Detection]:
+        """The parts in a frame, best first, those cut by the image's border included.
 
-    def detect_reduced(self, image: NDArray[np.uint8]) -> list[Detection]:
+        ``scale`` is the frame's (see :func:`perception.standard_view.frame_scale`).
+        """
+        height, width = frame.image.shape[:2]
+        least = REDUCTION / scale * NETWORK_STRIDE
+        if min(height, width) < least:
+            raise PerceptionError(
+                f"a frame of {width} x {height} pixels is too small; at least {least:.0f} on each side are needed"
+            )
+        return self.detect_reduced(*reduced(frame.image, REDUCTION / scale))
+
+    def detect_reduced(
+        self, image: NDArray[np.uint8], reduction: tuple[float, float] = (REDUCTION, REDUCTION)
+    ) -> list[Detection]:
         """The parts in an RGB image (H, W, 3) that is already reduced; centres are still in frame pixels."""
         height, width = image.shape[:2]
         bottom, right = -height % NETWORK_STRIDE, -width % NETWORK_STRIDE
@@ -274,4 +290,4 @@ class Segmenter:
             heat=outputs.heat,
             classes=outputs.classes,
         )
-        return decode(seen, 0, self.config)
+        return decode(seen, 0, self.config, reduction)

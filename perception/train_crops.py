@@ -34,10 +34,10 @@ SHIFT_PX = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class CropTrainingConfig(TrainingConfig):
-    """Where the crops are, besides how to train. ``validate`` crops of ``val`` are scored now and then."""
+    """Folders with the crops, besides how to train. ``validate`` crops of ``val`` are scored now and then."""
 
-    data: Path
-    val: Path
+    data: tuple[Path, ...]
+    val: tuple[Path, ...]
     out: Path = Path("perception/weights")
     parts_dir: Path | None = None
     validate: int = 400
@@ -176,7 +176,7 @@ def _train(
 ) -> TrainingResult:
     """Load the crops, train one network under the budget, score it on all of ``val`` and write its weights."""
     table = config.table
-    crops, val = load_crops(config.data), load_crops(config.val)
+    crops, val = load_crops(*config.data), load_crops(*config.val)
     labels, val_labels = label_crops(table, crops), label_crops(table, val)
     some = np.arange(0, len(val), max(1, len(val) // config.validate))
     some_val, some_labels = take_crops(val, some), val_labels.take(some)
@@ -186,7 +186,7 @@ def _train(
     result = train(name, model, step, config, config.out, validate=lambda m: score(m, some_val, some_labels, table))
     model.load_state_dict(result.state_dict)
     figures = score(model.eval(), val, val_labels, table)
-    data = {"train": manifest_hash(config.data), "val": manifest_hash(config.val)}
+    data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}
     names = [part.name for part in table.parts]
     metadata = weights_metadata(names, config, result, data, figures, config.parts_dir) | {"faces": table.describe()}
     save_weights(config.out / f"{name}.safetensors", result.state_dict, metadata)

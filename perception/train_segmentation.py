@@ -59,8 +59,8 @@ class SegmentationTraining(TrainingConfig):
     parts of other windows that are tried in free places of one.
     """
 
-    data: Path
-    val: Path
+    data: tuple[Path, ...]
+    val: tuple[Path, ...]
     out: Path = Path("perception/weights")
     start: Path | None = None
     minutes: float = 16.0
@@ -217,7 +217,7 @@ def train_segmentation(config: SegmentationTraining) -> None:
     cv2.setNumThreads(config.threads)
     names = BUILT_IN
     parts = [load_part(name) for name in names]
-    training, validation = (Windows(load_windows(path), parts) for path in (config.data, config.val))
+    training, validation = (Windows(load_windows(*paths), parts) for paths in (config.data, config.val))
     device = default_device()
     with seeded(config.seed):
         net = SegmentationNet(len(parts)).to(device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -242,8 +242,8 @@ def train_segmentation(config: SegmentationTraining) -> None:
     result = train("segmentation", net, step, config, config.out, validate=validate)
     net.load_state_dict(result.state_dict)
     decode, figures = best_threshold(net, names, validation)
-    data = {str(path): manifest_hash(path) for path in (config.data, config.val)}
-    metadata = weights_metadata(names, config, result, data, figures) | {"decode": asdict(decode)}
+    data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}
+    metadata = weights_metadata(names, config, result, data, figures) | {"decode": asdict(decode), "net": net.shape}
     metadata["minutes_before_start"] = minutes_before
     save_weights(config.out / WEIGHTS, result.state_dict, metadata)
     print("  ".join(f"{key} {value:.4f}" for key, value in figures.items()))

@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from cad.parts import Part
 from cad.spatial import Array
 from perception.dataset import WindowSet
+from perception.shadows import shadow
 
 MIN_VISIBLE_PX = 40
 """Slivers of fewer visible pixels (3 mm^2) at a window's border get no centre and do not count in the figures."""
+
+SHADOWED = 0.3
+"""Share of the examples over which something casts a shadow from outside."""
 
 
 @dataclass(frozen=True)
@@ -171,5 +175,7 @@ def recolour(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.u
     if rng.random() < 0.3:
         blurred = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.0))
         x = blurred if rng.random() < 0.6 else 2.0 * x - blurred
+    if rng.random() < SHADOWED:
+        x *= shadow(*x.shape[:2], rng)[..., None]
     x += rng.normal(0.0, rng.uniform(0.0, 5.0)) + rng.standard_normal(x.shape, np.float32) * rng.uniform(0.0, 5.0)
     return np.clip(x, 0, 255).astype(np.uint8)
