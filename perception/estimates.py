@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Array, Intrinsics
 
 ACCEPTED = "accepted"
+NOT_A_PART, OTHER_PART = "not a part", "unexpected part"
+"""Verdicts on what is not to be picked, however well it is seen."""
+AMBIGUOUS, POOR_CONTOUR = "ambiguous", "poor contour match"
+"""Verdicts on what another look may tell."""
 
 
 class PerceptionError(Exception):
@@ -24,6 +30,23 @@ class Frame:
     image: NDArray[np.uint8]
     intrinsics: Intrinsics
     time_s: float
+
+    @cached_property
+    def half(self) -> NDArray[np.uint8]:
+        """The image with every two by two pixels made one; an odd last row or column is left out."""
+        return halved(self.image)
+
+    @cached_property
+    def quarter(self) -> NDArray[np.uint8]:
+        """The half image halved again."""
+        return halved(self.half)
+
+
+def halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image (H, W, 3) half as large by area averaging, (H // 2, W // 2, 3)."""
+    height, width = (size // 2 for size in image.shape[:2])
+    even = image[: 2 * height, : 2 * width]
+    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)

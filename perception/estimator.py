@@ -20,7 +20,17 @@ from cad.tagboard import TagboardConfig
 from perception.calibration import camera_from_tags, table_from_board
 from perception.choice import ChoiceWeights
 from perception.crop_poses import CROP_PX, HALF, Candidate, CropPose, CropPoseConfig, CropSolver
-from perception.estimates import ACCEPTED, Frame, FrameEstimate, PartEstimate, PerceptionError
+from perception.estimates import (
+    ACCEPTED,
+    AMBIGUOUS,
+    NOT_A_PART,
+    OTHER_PART,
+    POOR_CONTOUR,
+    Frame,
+    FrameEstimate,
+    PartEstimate,
+    PerceptionError,
+)
 from perception.pnp import PnpError, solve_pnp
 from perception.posenets import PoseNets
 from perception.segmentation import Detection, Segmenter
@@ -37,8 +47,6 @@ WEIGHT_FILES = (
     "keypoints.safetensors",
     "choice.json",
 )
-
-NOT_A_PART, AMBIGUOUS, POOR_CONTOUR, OTHER_PART = "not a part", "ambiguous", "poor contour match", "unexpected part"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,8 @@ from cad.parts import planar
 from cad.spatial import BASLER, apply, rotation_from_rotvec, transform
 from perception.choice import FEATURES, GATE_FEATURES, ChoiceWeights
 from perception.crop_poses import CropPoseConfig, CropSolver
-from perception.estimates import Frame, PartEstimate, PerceptionError
-from perception.estimator import AMBIGUOUS, NOT_A_PART, EstimatorConfig, LearnedEstimator, cut_crops, drop_repeated
+from perception.estimates import AMBIGUOUS, NOT_A_PART, Frame, PartEstimate, PerceptionError
+from perception.estimator import EstimatorConfig, LearnedEstimator, cut_crops, drop_repeated
 from perception.faces import FaceTable
 from perception.posenets import CropKeypoints, CropReading, Hypothesis, PoseNets
 from perception.segmentation import Detection
