@@ -32,8 +32,8 @@ DIAMETER_MM = (0.5, 1e3)
 class Entry:
     """One image of a shard and what its JSON files say about it.
 
-    ``instances`` are the entries of ``scene_gt.json`` of the parts of which something is seen, ``places`` their numbers
-    among all parts of the image, which name their masks.
+    ``instances`` are the entries of ``scene_gt.json`` of the parts of which something is seen, ``infos`` those of
+    ``scene_gt_info.json``, ``places`` their numbers among all parts of the image, which name their masks.
     """
 
     shard: Path
@@ -41,6 +41,7 @@ class Entry:
     camera: dict[str, Any]
     instances: list[dict[str, Any]]
     places: list[int]
+    infos: list[dict[str, Any]]
 
     @property
     def K(self) -> Array:
@@ -143,7 +144,8 @@ def _read(shard: Path) -> list[Entry]:
                 f"image {image} of {shard} has parts with no stable_pose: only data sets that Tagcell made can be read"
             )
         places = [k for k, info in enumerate(infos[image]) if info["px_count_visib"] > 0]
-        entries.append(Entry(shard, int(image), cameras[image], [truths[image][k] for k in places], places))
+        truth, info = ([of[image][k] for k in places] for of in (truths, infos))
+        entries.append(Entry(shard, int(image), cameras[image], truth, places, info))
     return entries
 
 

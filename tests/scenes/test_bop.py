@@ -15,9 +15,10 @@ from pycocotools.coco import COCO
 
 from cad.equivalence import Axis, Symmetries, symmetries_from_json
 from cad.parts import load_mesh
+from cad.run_lengths import encode_runs
 from cad.spatial import BASLER, rotation_x, rotation_z, transform
 from scenes.bop import DEPTH_SCALE, Annotation, ShardWriter, depth_units, write_camera, write_models
-from scenes.coco import encode_runs, merged
+from scenes.coco import merged
 from scenes.errors import SceneError
 
 SHAPE = (48, 64)
