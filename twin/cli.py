@@ -18,6 +18,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 from cad.parts import CadError
 from perception.estimates import PerceptionError
 from scenes.errors import SceneError
+from twin.estimate_cli import Estimate
 from twin.part_cli import Part
 from twin.pick_config import PickConfig
 from twin.render_cli import Data, Render
@@ -117,6 +118,7 @@ Verb = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Data, subcommand("data")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Estimate, subcommand("estimate")]
     | Annotated[Part, subcommand("part")]
     | Annotated[View, subcommand("view")]
     | Annotated[Doctor, subcommand("doctor")]

@@ -13,6 +13,7 @@ from cad.parts import Part, load_part
 from cad.robot import JOINT_NAMES
 from cad.spatial import Array, inverse, rotation_from_rotvec, transform
 from perception.estimates import Frame, FrameEstimate, PoseEstimator
+from perception.overlay import save_picture
 from scenes.camera import camera_pose, set_camera_pose
 from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
@@ -24,7 +25,7 @@ from twin.controller import PickController
 from twin.nominal import nominal_calibration
 from twin.oracle import OracleEstimator
 from twin.pick_config import PickConfig
-from twin.pictures import annotate, grasp_in_camera, save_picture
+from twin.pictures import annotate, grasp_in_camera
 from twin.referee import Referee
 from twin.robot import RobotError
 from twin.scorecard import SceneResult

@@ -10,12 +10,12 @@ import numpy as np
 from cad.parts import BUILT_IN
 from cad.robot import JOINT_NAMES
 from cad.spatial import Array, rotation_x, transform
+from perception.overlay import save_picture
 from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
 from scenes.placement import settle_parts
 from scenes.workcell import OVERVIEW, OVERVIEW_INTRINSICS, CellConfig, build_arm, build_workcell, set_parts
 from twin.ik import ArmIk
-from twin.pictures import save_picture
 from twin.robot import TwinError
 
 FRAME_WIDTH = 1368

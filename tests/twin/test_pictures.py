@@ -4,7 +4,8 @@ import numpy as np
 from cad.parts import load_part
 from cad.spatial import BASLER, rotation_x, transform
 from perception.estimates import Frame, FrameEstimate, PartEstimate
-from twin.pictures import INSET, annotate, save_picture
+from perception.overlay import INSET, save_picture
+from twin.pictures import annotate
 
 PARTS = {name: load_part(name) for name in ("main", "top")}
 
