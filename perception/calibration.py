@@ -22,7 +22,7 @@ MIN_TAGS = 4
 MAX_ERROR_PX = 2.0
 """A tag with a corner further than this from where the pose puts it is left out (occluded, or not a tag)."""
 DETECTION_WIDTH_PX = 1400
-"""The image is reduced by a whole factor to about this width to find tags."""
+"""Tags are found in an image of about this width or less: the frame, its half or its quarter."""
 REFINEMENT_WINDOWS_PX = (14, 9)
 """Half widths of corner refinement at 20 MP, coarse then fine; a code cell is 45 px wide there."""
 
@@ -41,7 +41,7 @@ def camera_from_tags(frame: Frame, tagboard: TagboardConfig) -> TagPose:
 
     Raises PerceptionError with the number of tags seen when there are fewer than four that agree on a pose.
     """
-    ids, corners_px = find_tags(frame.image, tagboard)
+    ids, corners_px = find_tags(frame, tagboard)
     _check_count(ids, tagboard, "seen")
     points = np.stack([tagboard.corners(int(i)) for i in ids])  # (T, 4, 3)
     while True:
@@ -63,37 +63,40 @@ def _check_count(ids: NDArray[np.int64], tagboard: TagboardConfig, what: str) ->
         )
 
 
-def find_tags(image: NDArray[np.uint8], tagboard: TagboardConfig) -> tuple[NDArray[np.int64], Array]:
-    """Ids (T,) and refined corners (T, 4, 2) in pixels of the board's tags in an RGB image, sorted by id.
+def find_tags(frame: Frame, tagboard: TagboardConfig) -> tuple[NDArray[np.int64], Array]:
+    """Ids (T,) and refined corners (T, 4, 2) in pixels of the board's tags in a frame, sorted by id.
 
     Tags with an id that the board does not have are left out.
     """
-    gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    factor = max(1, round(gray.shape[1] / DETECTION_WIDTH_PX))
-    height, width = (size // factor * factor for size in gray.shape)
-    reduced = cv2.resize(gray[:height, :width], (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    width = frame.image.shape[1]
+    factor = next((n for n in (1, 2) if width / n <= 1.5 * DETECTION_WIDTH_PX), 4)
+    reduced = frame.image if factor == 1 else frame.half if factor == 2 else frame.quarter
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
-    found, found_ids, _ = detector.detectMarkers(reduced)
+    found, found_ids, _ = detector.detectMarkers(cv2.cvtColor(reduced, cv2.COLOR_RGB2GRAY))
     ids = np.array([] if found_ids is None else found_ids, np.int64).ravel()
     corners = np.array(found, np.float32).reshape(-1, 4, 2)
     order = [k for k in np.argsort(ids, kind="stable") if ids[k] in tagboard.ids]
     ids, corners = ids[order], (corners[order] + 0.5) * factor - 0.5
     if not len(ids):
         return ids, np.zeros((0, 4, 2))
-    for window in REFINEMENT_WINDOWS_PX:
-        corners = _refine(gray, corners, window)
-    return ids, corners.astype(np.float64)
-
-
-def _refine(gray: NDArray[np.uint8], corners: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """Corners moved to sub-pixel accuracy; the window shrinks with tags that are seen smaller than on a 20 MP frame."""
     side_px = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
-    half = max(2, min(window, int(side_px / 8 * 0.4)))
+    return ids, np.stack([_refine(frame.image, tag, side_px) for tag in corners]).astype(np.float64)
+
+
+def _refine(image: NDArray[np.uint8], corners: NDArray[np.float32], side_px: float) -> NDArray[np.float32]:
+    """A tag's corners (4, 2) moved to sub-pixel accuracy; windows shrink with tags that are smaller than on 20 MP."""
+    halves = [max(2, min(window, int(side_px / 8 * 0.4))) for window in REFINEMENT_WINDOWS_PX]
+    margin = 2 * max(halves) + 4
+    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - margin, 0)
+    high = np.ceil(corners.max(axis=0)).astype(int) + margin + 1
+    gray = cv2.cvtColor(np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]]), cv2.COLOR_RGB2GRAY)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
-    refined = cv2.cornerSubPix(gray, corners.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
-    return np.asarray(refined, np.float32).reshape(-1, 4, 2)
+    refined = (corners - low).astype(np.float32).reshape(-1, 1, 2)
+    for half in halves:
+        refined = cv2.cornerSubPix(gray, refined, (half, half), (-1, -1), criteria)
+    return np.asarray(refined, np.float32).reshape(-1, 2) + low.astype(np.float32)
 
 
 def solve_planar_pose(points: Array, pixels: Array, intrinsics: Intrinsics) -> Array:

@@ -272,7 +272,7 @@ class Segmenter:
             raise PerceptionError(
                 f"a frame of {width} x {height} pixels is too small; at least {least:.0f} on each side are needed"
             )
-        return self.detect_reduced(*reduced(frame.image, REDUCTION / scale))
+        return self.detect_reduced(*reduced(frame, REDUCTION / scale))
 
     def detect_reduced(
         self, image: NDArray[np.uint8], reduction: tuple[float, float] = (REDUCTION, REDUCTION)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cad.spatial import BASLER, Array, Intrinsics
-from perception.estimates import PerceptionError
+from perception.estimates import Frame, PerceptionError
 
 NOMINAL_HEIGHT_M = 0.70
 STANDARD_M = NOMINAL_HEIGHT_M / BASLER.fx
@@ -41,22 +41,21 @@ def frame_scale(intrinsics: Intrinsics, T_cam_table: Array) -> float:
     return 1.0 if abs(scale - 1.0) <= AS_IT_IS else scale
 
 
-def reduced(image: NDArray[np.uint8], factor: float) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """An image ``factor`` times smaller (larger where it is below 1), and how many pixels one of its pixels is, (u, v).
+def reduced(frame: Frame, factor: float) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """A frame's image ``factor`` times smaller (larger below 1), and how many pixels one of its pixels is, (u, v).
 
-    Whole pixels come out, so the two factors differ a little from the one asked for.
+    Whole pixels come out, so the two differ a little from the factor asked for.
     """
-    height, width = image.shape[:2]
-    size = max(1, round(width / factor)), max(1, round(height / factor))
-    if (width // factor, height // factor) == (width / factor, height / factor) or factor < 1.0:
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if factor >= 1.0 else cv2.INTER_CUBIC)
+    if factor >= 4.0:
+        base, done = frame.quarter, 4
     else:
-        # By half first, which is quick and exact; what is left is less than two.
-        while factor >= 4.0 and not (image.shape[0] % 2 or image.shape[1] % 2):
-            image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-            factor /= 2.0
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8), (width / size[0], height / size[1])
+        base, done = (frame.half, 2) if factor >= 2.0 else (frame.image, 1)
+    height, width = base.shape[:2]
+    size = max(1, round(width * done / factor)), max(1, round(height * done / factor))
+    if size != (width, height):
+        how = cv2.INTER_AREA if factor >= done else cv2.INTER_CUBIC
+        base = np.asarray(cv2.resize(base, size, interpolation=how), np.uint8)
+    return base, (done * width / size[0], done * height / size[1])
 
 
 def standard_crop(

@@ -80,7 +80,7 @@ def level_view() -> tuple[Array, NDArray[np.uint8]]:
 def test_pixel_centres_are_integers(level_view: tuple[Array, NDArray[np.uint8]]) -> None:
     """The mean of the corner errors, over the four corners of each tag, shows no shift of half a pixel."""
     T_cam_board, image = level_view
-    ids, corners_px = find_tags(image, BOARD)
+    ids, corners_px = find_tags(frame(image), BOARD)
     truth = HALF.project(apply(T_cam_board, np.stack([BOARD.corners(int(i)) for i in ids])))
     assert np.all(np.abs((corners_px - truth).mean(axis=(0, 1))) < 0.03)
 
