@@ -73,12 +73,13 @@ class FrameTruth:
         return float(x), float(y)
 
     def brightness(self, image: NDArray[np.uint8], point_cam: Array) -> float:
-        """Mean grey level of the 256 x 256 pixels of ``image`` (H, W, 3) round the picture of a point (3,) of ``cam``;
-        NaN when none of them is in the image.
+        """Mean grey level of the 256 x 256 pixels of ``image`` (H, W, 3) round the picture of a point (3,) of ``cam``,
+        or of those nearest to it when some lie outside of the image.
         """
-        u, v = (int(c) for c in np.round(self.intrinsics.project(point_cam)) - _SURROUNDINGS_PX // 2)
-        window = image[max(v, 0) : max(v + _SURROUNDINGS_PX, 0), max(u, 0) : max(u + _SURROUNDINGS_PX, 0)]
-        return float(cv2.cvtColor(window, cv2.COLOR_RGB2GRAY).mean()) if window.size else float("nan")
+        corner = np.round(self.intrinsics.project(point_cam)) - _SURROUNDINGS_PX // 2
+        u, v = np.clip(corner, 0, np.maximum(np.array(image.shape[1::-1]) - _SURROUNDINGS_PX, 0)).astype(int)
+        window = image[v : v + _SURROUNDINGS_PX, u : u + _SURROUNDINGS_PX]
+        return float(cv2.cvtColor(window, cv2.COLOR_RGB2GRAY).mean())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +107,8 @@ class GroundTruth:
 def read_ground_truth(data_dir: Path, parts_dir: Path | None = None) -> GroundTruth:
     """The frames of a finished data set.
 
-    Raises PerceptionError when it is not finished, does not hold whole frames, or was rendered with other meshes than the parts have now.
+    Raises PerceptionError when it is not finished, does not hold whole frames, or was rendered with other meshes than
+    the parts have now.
     """
     entries = read_entries(data_dir)
     dataset = read_json(data_dir / DATASET)
