@@ -27,6 +27,7 @@ from perception.labels import CropLabels, label_crops, take_crops
 from perception.pvnet import GRID, PVNet, pvnet_loss, sample_cells
 from perception.score_crops import score_classifier, score_keypoints, score_verifier
 from perception.training import Step, TrainingConfig, TrainingResult, save_weights, seeded, train, weights_metadata
+from perception.training_pictures import classifier_sheet, keypoints_sheet, save_picture
 from perception.verifier import PairSampler, Verifier, listwise, verifier_loss
 
 SHIFT_PX = 3.0
@@ -34,18 +35,22 @@ SHIFT_PX = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class CropTrainingConfig(TrainingConfig):
-    """Folders with the crops, besides how to train. ``validate`` crops of ``val`` are scored now and then."""
+    """Folders with the crops, besides how to train. ``validate`` crops of ``val`` are scored now and then.
+
+    ``parts`` are those that the crops show, the built-in ones by default.
+    """
 
     data: tuple[Path, ...]
     val: tuple[Path, ...]
     out: Path = Path("perception/weights")
+    parts: tuple[str, ...] = ()
     parts_dir: Path | None = None
     validate: int = 400
 
     @cached_property
     def table(self) -> FaceTable:
         """The faces of all parts."""
-        return FaceTable.load(parts_dir=self.parts_dir)
+        return FaceTable.load(self.parts, self.parts_dir)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,10 +91,17 @@ class CropSource:
         self.photometric = Photometric(np.random.default_rng(seed))
 
     def draw(
-        self, count: int, rng: np.random.Generator, with_masks: bool = False
+        self,
+        count: int,
+        rng: np.random.Generator,
+        with_masks: bool = False,
+        among: NDArray[np.int64] | None = None,
     ) -> tuple[NDArray[np.uint8], CropLabels, NDArray[np.bool_]]:
-        """Images (B, 128, 128, 3), labels and, when asked for, masks on the voting grid (B, 64, 64)."""
-        rows = rng.integers(len(self.crops), size=count)
+        """Images (B, 128, 128, 3), labels and, when asked for, masks on the voting grid (B, 64, 64).
+
+        Only the crops whose numbers are ``among`` are drawn when that is given.
+        """
+        rows = rng.integers(len(self.crops), size=count) if among is None else rng.choice(among, count)
         angles = rng.uniform(0.0, 2 * np.pi, count)
         warps = np.stack([crop_warp(a, rng.uniform(-SHIFT_PX, SHIFT_PX, 2)) for a in angles])
         images = np.stack([warp_image(self.crops.images[r], w) for r, w in zip(rows, warps, strict=True)])
@@ -150,31 +162,42 @@ def keypoints_step(model: PVNet, source: CropSource, config: KeypointsConfig) ->
 
 def train_classifier(config: ClassifierConfig) -> TrainingResult:
     """Train J and write ``classifier.safetensors``."""
-    return _train("classifier", config, lambda table: JointClassifier(len(table)), classifier_step, score_classifier)
+    return train_on_crops(
+        "classifier",
+        config,
+        lambda table: JointClassifier(len(table)),
+        classifier_step,
+        score_classifier,
+        draw=classifier_sheet,
+    )
 
 
 def train_verifier(config: VerifierConfig) -> TrainingResult:
     """Train V and write ``verifier.safetensors``."""
-    return _train("verifier", config, lambda table: Verifier(len(table)), verifier_step, score_verifier)
+    return train_on_crops("verifier", config, lambda table: Verifier(len(table)), verifier_step, score_verifier)
 
 
 def train_keypoints(config: KeypointsConfig) -> TrainingResult:
     """Train the keypoint votes and write ``keypoints.safetensors``."""
-    return _train("keypoints", config, PVNet.for_table, keypoints_step, score_keypoints)
+    return train_on_crops("keypoints", config, PVNet.for_table, keypoints_step, score_keypoints, draw=keypoints_sheet)
 
 
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound=CropTrainingConfig)
 
 
-def _train(
+def train_on_crops(
     name: str,
     config: Config,
     build: Callable[[FaceTable], Network],
     make_step: Callable[[Network, CropSource, Config], Step],
     score: Callable[[Any, CropSet, CropLabels, FaceTable], dict[str, float]],
+    draw: Callable[[Any, CropSet, CropLabels, FaceTable], NDArray[np.uint8]] | None = None,
 ) -> TrainingResult:
-    """Load the crops, train one network under the budget, score it on all of ``val`` and write its weights."""
+    """Load the crops, train one network under the budget, score it on all of ``val`` and write its weights.
+
+    Whenever it is validated, what ``draw`` makes of some crops is kept as ``NAME_predictions.png``.
+    """
     table = config.table
     crops, val = load_crops(*config.data), load_crops(*config.val)
     labels, val_labels = label_crops(table, crops), label_crops(table, val)
@@ -183,7 +206,13 @@ def _train(
     with seeded(config.seed):
         model = build(table).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     step = make_step(model, CropSource(crops, labels, config.seed), config)
-    result = train(name, model, step, config, config.out, validate=lambda m: score(m, some_val, some_labels, table))
+
+    def validate(now: nn.Module) -> dict[str, float]:
+        if draw is not None:
+            save_picture(config.out / f"{name}_predictions.png", draw(now, some_val, some_labels, table))
+        return score(now, some_val, some_labels, table)
+
+    result = train(name, model, step, config, config.out, validate=validate)
     model.load_state_dict(result.state_dict)
     figures = score(model.eval(), val, val_labels, table)
     data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}

@@ -42,10 +42,12 @@ from perception.training import (
     train,
     weights_metadata,
 )
+from perception.training_pictures import save_picture, segmentation_sheet
 from perception.windows import MIN_VISIBLE_PX, Window, Windows, cut, flip, paste, recolour, warp
 
 NO_CLASS = -100
 HEAT_SIGMA_CELLS = 1.1
+PICTURED = 6
 ALLOWED_LOSS = 0.005
 """Share of the parts whose loss is worth fewer false detections."""
 
@@ -54,14 +56,17 @@ ALLOWED_LOSS = 0.005
 class SegmentationTraining(TrainingConfig):
     """Where the windows are and how they are varied; the rest as in ``TrainingConfig``.
 
-    ``start`` names a folder with earlier weights to go on from. ``size`` is the side of the squares cut from the
-    windows, a multiple of 16, ``warp`` the share of windows that are turned and scaled, ``paste`` the mean number of
-    parts of other windows that are tried in free places of one.
+    ``parts`` are those that the windows show, the built-in ones by default. ``start`` names a folder with earlier
+    weights to go on from. ``size`` is the side of the squares cut from the windows, a multiple of 16, ``warp`` the
+    share of windows that are turned and scaled, ``paste`` the mean number of parts of other windows that are tried in
+    free places of one.
     """
 
     data: tuple[Path, ...]
     val: tuple[Path, ...]
     out: Path = Path("perception/weights")
+    parts: tuple[str, ...] = ()
+    parts_dir: Path | None = None
     start: Path | None = None
     minutes: float = 16.0
     batch: int = 12
@@ -215,15 +220,15 @@ def figures_of(examined: Sequence[Examined], min_score: float = 0.0) -> dict[str
 def train_segmentation(config: SegmentationTraining) -> None:
     """Train, pick the score threshold on the validation windows, and keep the weights with their figures."""
     cv2.setNumThreads(config.threads)
-    names = BUILT_IN
-    parts = [load_part(name) for name in names]
+    names = config.parts or BUILT_IN
+    parts = [load_part(name, config.parts_dir) for name in names]
     training, validation = (Windows(load_windows(*paths), parts) for paths in (config.data, config.val))
     device = default_device()
     with seeded(config.seed):
         net = SegmentationNet(len(parts)).to(device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     minutes_before = 0.0
     if config.start is not None:
-        state, earlier = load_weights(config.start / WEIGHTS)
+        state, earlier = load_weights(config.start / WEIGHTS, config.parts_dir)
         net.load_state_dict(state)
         minutes_before = earlier["minutes"] + earlier.get("minutes_before_start", 0.0)
 
@@ -235,15 +240,21 @@ def train_segmentation(config: SegmentationTraining) -> None:
 
     def validate(model: nn.Module) -> dict[str, float]:
         assert isinstance(model, SegmentationNet)
-        few = (validation[i] for i in range(min(config.validate_windows, len(validation))))
-        figures = figures_of(examine(Segmenter(model, names, DecodeConfig()), few))
+        few = [validation[i] for i in range(min(config.validate_windows, len(validation)))]
+        segmenter = Segmenter(model, names, DecodeConfig())
+        shown = [window for window in few if len(window.centres)][:PICTURED]
+        save_picture(config.out / "segmentation_predictions.png", segmentation_sheet(segmenter, shown))
+        figures = figures_of(examine(segmenter, few))
         return {key: figures[key] for key in ("ap50", "precision50", "recall50", "centre_median_px")}
 
     result = train("segmentation", net, step, config, config.out, validate=validate)
     net.load_state_dict(result.state_dict)
     decode, figures = best_threshold(net, names, validation)
     data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}
-    metadata = weights_metadata(names, config, result, data, figures) | {"decode": asdict(decode), "net": net.shape}
+    metadata = weights_metadata(names, config, result, data, figures, config.parts_dir) | {
+        "decode": asdict(decode),
+        "net": net.shape,
+    }
     metadata["minutes_before_start"] = minutes_before
     save_weights(config.out / WEIGHTS, result.state_dict, metadata)
     print("  ".join(f"{key} {value:.4f}" for key, value in figures.items()))

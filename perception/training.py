@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 from cad.parts import load_part
 from perception.estimates import PerceptionError
+from perception.training_curves import VALIDATION, plot_curves
 
 StateDict = dict[str, Tensor]
 Losses = dict[str, Tensor]
@@ -109,9 +110,9 @@ def train(
 ) -> TrainingResult:
     """Train ``model`` in place under the budget and return its averaged weights.
 
-    Writes ``out_dir/NAME.csv`` (curves) and, while it runs, ``out_dir/NAME.checkpoint``; a run that was cut short goes
-    on from there when it is started again with the same config. ``validate`` gets the averaged model in eval mode; the
-    time that it takes is not counted. Raises PerceptionError when the loss is no longer finite.
+    Writes ``NAME.csv`` and ``NAME.png`` (curves) and, while it runs, ``NAME.checkpoint`` into ``out_dir``; a run that was
+    cut short goes on from there when it is started again with the same config. ``validate`` gets the averaged model in
+    eval mode; the time that it takes is not counted. Raises PerceptionError when the loss is no longer finite.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(config.threads)
@@ -216,7 +217,8 @@ class _Run:
             figures = validate(self.model)
         self.model.load_state_dict(live)
         self.model.train()
-        self.log({f"val_{key}": value for key, value in figures.items()})
+        self.log({f"{VALIDATION}{key}": value for key, value in figures.items()})
+        plot_curves(self.csv_path)
         self.started = time.monotonic()
 
     def checkpoint(self) -> None:
