@@ -1,7 +1,8 @@
-"""Convolution blocks that the crop networks are made of."""
+"""Convolution blocks that networks are made of, and the device that they run on."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -26,3 +27,8 @@ class Residual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Same shape as ``x``."""
         return functional.relu(x + self.second(self.first(x)))
+
+
+def default_device() -> torch.device:
+    """The GPU when there is one, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -21,9 +21,9 @@ from perception.classifier import JointClassifier, classify, modes
 from perception.estimates import PerceptionError
 from perception.faces import FaceTable
 from perception.pvnet import PVNet, infer_votes
-from perception.training import load_weights
 from perception.verifier import Verifier, rectify, score_views
 from perception.voting import offset_vote, ransac_vote
+from perception.weight_files import load_weights
 
 PROPOSALS = 6
 AXES = 2

@@ -23,8 +23,9 @@ from torch.nn import functional
 
 from cad.spatial import Array
 from perception.estimates import Frame, PerceptionError
+from perception.layers import default_device
 from perception.standard_view import reduced
-from perception.training import default_device, load_weights
+from perception.weight_files import load_weights
 
 REDUCTION = 4
 """Frame pixels along each side of a pixel that the network sees."""

@@ -26,9 +26,10 @@ from perception.faces import FaceTable
 from perception.labels import CropLabels, label_crops, take_crops
 from perception.pvnet import GRID, PVNet, pvnet_loss, sample_cells
 from perception.score_crops import score_classifier, score_keypoints, score_verifier
-from perception.training import Step, TrainingConfig, TrainingResult, save_weights, seeded, train, weights_metadata
+from perception.training import Step, TrainingConfig, TrainingResult, seeded, train
 from perception.training_pictures import classifier_sheet, keypoints_sheet, save_picture
 from perception.verifier import PairSampler, Verifier, listwise, verifier_loss
+from perception.weight_files import save_weights, weights_metadata
 
 SHIFT_PX = 3.0
 

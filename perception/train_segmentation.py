@@ -18,6 +18,7 @@ from cad.parts import BUILT_IN, load_part
 from cad.spatial import Array
 from perception.bop_files import manifest_hash
 from perception.dataset import load_windows
+from perception.layers import default_device
 from perception.metrics import DetectionScores, mask_iou, summary
 from perception.segmentation import (
     HEAT_STRIDE,
@@ -32,17 +33,9 @@ from perception.segmentation import (
     normalise,
     reduced_autocast,
 )
-from perception.training import (
-    Losses,
-    TrainingConfig,
-    default_device,
-    load_weights,
-    save_weights,
-    seeded,
-    train,
-    weights_metadata,
-)
+from perception.training import Losses, TrainingConfig, seeded, train
 from perception.training_pictures import save_picture, segmentation_sheet
+from perception.weight_files import load_weights, save_weights, weights_metadata
 from perception.windows import MIN_VISIBLE_PX, Window, Windows, cut, flip, paste, recolour, warp
 
 NO_CLASS = -100

@@ -1,36 +1,28 @@
-"""The training loop and the weight files that every network of ``perception`` shares.
+"""The training loop that every network of ``perception`` shares.
 
 ``train`` runs a step function under a time budget: AdamW, linear warm-up and cosine decay over the budget, gradient
 clipping, an exponential moving average of the weights (the one that is kept), a checkpoint every minute that a later
-call resumes from, and a CSV of the curves. ``save_weights`` and ``load_weights`` keep a network's weights in one
-safetensors file whose metadata says what it was trained on and for which parts.
+call resumes from, and a CSV of the curves.
 """
 
 from __future__ import annotations
 
 import contextlib
 import csv
-import json
 import os
-import shlex
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from cad.parts import load_part
 from perception.estimates import PerceptionError
 from perception.training_curves import VALIDATION, plot_curves
+from perception.weight_files import StateDict
 
-StateDict = dict[str, Tensor]
 Losses = dict[str, Tensor]
 Step = Callable[[np.random.Generator], Losses]
 """Draws a batch with the generator, runs the model, returns weighted loss terms; their sum is minimised."""
@@ -80,11 +72,6 @@ class TrainingResult:
     minutes: float
 
 
-def default_device() -> torch.device:
-    """The GPU when there is one, else the CPU."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Inside, torch draws from ``seed`` (build the model here); outside, its generators are as they were."""
@@ -110,9 +97,9 @@ def train(
 ) -> TrainingResult:
     """Train ``model`` in place under the budget and return its averaged weights.
 
-    Writes ``NAME.csv`` and ``NAME.png`` (curves) and, while it runs, ``NAME.checkpoint`` into ``out_dir``; a run that was
-    cut short goes on from there when it is started again with the same config. ``validate`` gets the averaged model in
-    eval mode; the time that it takes is not counted. Raises PerceptionError when the loss is no longer finite.
+    Writes ``NAME.csv`` and ``NAME.png`` (curves) and, while it runs, ``NAME.checkpoint`` into ``out_dir``; a run that
+    was cut short goes on from there when it is started again with the same config. ``validate`` gets the averaged model
+    in eval mode; the time that it takes is not counted. Raises PerceptionError when the loss is no longer finite.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(config.threads)
@@ -256,67 +243,3 @@ class _Run:
         self.smooth, self.rows = state["smooth"], state["rows"]
         self.last = dict.fromkeys(self.last, self.seconds)
         self.started = time.monotonic()
-
-
-def weights_metadata(
-    part_names: Sequence[str],
-    config: TrainingConfig,
-    result: TrainingResult,
-    data: dict[str, str],
-    figures: dict[str, float],
-    parts_dir: Path | None = None,
-) -> dict[str, Any]:
-    """What a weight file says about itself: parts with mesh hashes, command, config, data manifests, figures."""
-    parts = {}
-    for name in part_names:
-        part = load_part(name, parts_dir)
-        parts[name] = {"mesh_hash": part.mesh_hash, "stable_poses": len(part.stable_poses)}
-    return {
-        "parts": parts,
-        "command": "python -m perception.train " + shlex.join(sys.argv[1:]),
-        "config": json.loads(json.dumps(asdict(config), default=str)),
-        "minutes": round(result.minutes, 2),
-        "steps": result.steps,
-        "data": data,
-        "figures": {key: round(float(value), 5) for key, value in figures.items()},
-        "torch": torch.__version__,
-    }
-
-
-def save_weights(path: Path, state_dict: StateDict, metadata: dict[str, Any]) -> None:
-    """Write weights (matrices and kernels as float16, the rest as it is) and metadata; a JSON copy goes beside them."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {
-        key: (value.half() if value.dtype.is_floating_point and value.ndim > 1 else value).contiguous()
-        for key, value in state_dict.items()
-    }
-    aside = path.with_suffix(".part")
-    save_file(tensors, str(aside), metadata={"tagcell": json.dumps(metadata)})
-    os.replace(aside, path)
-    path.with_suffix(".json").write_text(json.dumps(metadata, indent=2) + "\n")
-
-
-def load_weights(path: Path, parts_dir: Path | None = None) -> tuple[StateDict, dict[str, Any]]:
-    """Weights as float32 and their metadata.
-
-    Raises PerceptionError when the file is missing or unreadable, or when a part's mesh or stable poses are no longer
-    those the weights were trained for.
-    """
-    if not path.exists():
-        raise PerceptionError(f"no weights at {path}; train them with `python -m perception.train {path.stem}`")
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            metadata = json.loads((file.metadata() or {}).get("tagcell", "{}"))
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
-    except SafetensorError as error:
-        raise PerceptionError(f"{path} cannot be read as safetensors ({error}); train again") from error
-    if "parts" not in metadata:
-        raise PerceptionError(f"{path} does not say which parts it is for; train again")
-    for name, stored in metadata["parts"].items():
-        part = load_part(name, parts_dir)
-        if (part.mesh_hash, len(part.stable_poses)) != (stored["mesh_hash"], stored["stable_poses"]):
-            raise PerceptionError(
-                f"{path.name} was trained for {name} with mesh {stored['mesh_hash']} and {stored['stable_poses']} "
-                f"stable poses, the part now has {part.mesh_hash} and {len(part.stable_poses)}: train again"
-            )
-    return {key: value.float() if value.dtype.is_floating_point else value for key, value in state.items()}, metadata

@@ -10,8 +10,9 @@ from perception.estimates import PerceptionError
 from perception.faces import FaceTable
 from perception.posenets import PoseNets
 from perception.pvnet import PVNet
-from perception.training import TrainingConfig, TrainingResult, save_weights, weights_metadata
+from perception.training import TrainingConfig, TrainingResult
 from perception.verifier import Verifier
+from perception.weight_files import save_weights, weights_metadata
 
 TABLE = FaceTable.load()
 CROPS = np.random.default_rng(0).integers(0, 255, (3, 128, 128, 3), dtype=np.uint8)

@@ -9,16 +9,8 @@ from torch import nn
 from perception import training
 from perception.estimates import PerceptionError
 from perception.train import main, trainer
-from perception.training import (
-    TrainingConfig,
-    TrainingResult,
-    learning_rate_at,
-    load_weights,
-    save_weights,
-    seeded,
-    train,
-    weights_metadata,
-)
+from perception.training import TrainingConfig, TrainingResult, learning_rate_at, seeded, train
+from perception.weight_files import load_weights, save_weights, weights_metadata
 
 
 @dataclass(frozen=True)
