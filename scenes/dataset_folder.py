@@ -43,6 +43,8 @@ def identity(config: DatasetConfig) -> dict[str, Any]:
     content: dict[str, Any] = {"generator": GENERATOR} | asdict(config)
     del content["parts_dir"]
     content |= {"look": asdict(config.look_ranges), "shots": asdict(config.shot_ranges)}
+    if config.shot_ranges.empty_beside_px is None:  # as in data sets that were made before there was such a range
+        del content["shots"]["empty_beside_px"]
     content |= {"view": asdict(config.view_ranges)}
     content |= {"size": config.pixels, "downscale": config.scale_down, "shard": config.shard_size}
     content["parts"] = {part.name: _part_identity(part) for part in config.load_parts()}

@@ -107,6 +107,11 @@ class Layout:
         self._faces: Faces = faces
         self._board_half = board.width_m / 2, board.height_m / 2
         self._laid: list[tuple[_Thing, Array, float, float]] = []
+        self._clear = (0.0, 0.0, 0.0)
+
+    def keep_clear(self, x: float, y: float, radius_m: float) -> None:
+        """From now on lay no part with its centre inside of this circle."""
+        self._clear = x, y, radius_m
 
     def add_part(self, x: float, y: float) -> bool:
         """Lay a part at (x, y), or push it against what lies there; returns whether there was room for it."""
@@ -216,6 +221,9 @@ class Layout:
         half = self._ranges.area_half_m if thing.stable_pose >= 0 else self._board_half
         inset = 0.0 if thing.stable_pose >= 0 else thing.radius_m
         if abs(x) > half[0] - inset or abs(y) > half[1] - inset:
+            return False
+        clear_x, clear_y, clear_m = self._clear
+        if thing.stable_pose >= 0 and np.hypot(x - clear_x, y - clear_y) < clear_m:
             return False
         gap = thing.radius_m + self._ranges.gap_m[0]
         for k, (other, _, other_x, other_y) in enumerate(self._laid):

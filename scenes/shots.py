@@ -46,6 +46,9 @@ class ShotRanges(LayoutRanges):
     ``window_on_area`` of the windows are centred on the area that parts lie in, the others are anywhere in the frame;
     parts' centres are up to ``window_beyond_m`` outside of the window, so that its border cuts some. The pairs are
     ranges of counts, both ends included; places where there is no room are given up, so there may be fewer.
+
+    Where ``target_share`` is 0, ``empty_beside_px`` may put parts beside the empty middle of crops: as many as
+    ``neighbours`` says, their centres that far from it in pixels of the full-resolution frame.
     """
 
     centre_jitter_px: int = 24
@@ -53,6 +56,7 @@ class ShotRanges(LayoutRanges):
     neighbours: tuple[float, ...] = (0.45, 0.25, 0.2, 0.1)
     crop_distractors: tuple[float, ...] = (0.6, 0.2, 0.12, 0.08)
     crop_crumbs: tuple[int, int] = (0, 1)
+    empty_beside_px: tuple[int, int] | None = None
     window_on_area: float = 0.7
     window_beyond_m: float = 0.002
     window_parts: tuple[int, int] = (0, 8)
@@ -76,6 +80,13 @@ class ShotRanges(LayoutRanges):
         for name in ("target_share", "window_on_area"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SceneError(f"{name} {getattr(self, name)}: must be from 0 to 1")
+        if self.empty_beside_px is not None and self.target_share > 0:
+            raise SceneError(
+                f"empty_beside_px {self.empty_beside_px} and target_share {self.target_share}: the first part of a crop "
+                "is its target, so only sets without targets show parts beside an empty middle; set target_share to 0"
+            )
+        if self.empty_beside_px is not None and not 0 < self.empty_beside_px[0] <= self.empty_beside_px[1]:
+            raise SceneError(f"empty_beside_px {self.empty_beside_px}: must be a range of pixels above 0")
         if self.centre_jitter_px < 0 or self.window_beyond_m < 0:
             raise SceneError(
                 f"centre_jitter_px {self.centre_jitter_px}, window_beyond_m {self.window_beyond_m}: from 0 upwards"
@@ -152,6 +163,10 @@ class ShotSampler:
         window = BASLER.crop(int(corner[0]), int(corner[1]), width, height).downscaled(downscale)
         for _ in range(rng.integers(*ranges.crop_crumbs, endpoint=True)):
             layout.add_crumb(*_place_in(window, T_board_cam, rng))
+        if ranges.empty_beside_px is not None:
+            low, high = (distance / downscale for distance in ranges.empty_beside_px)
+            for _ in range(_count(ranges.neighbours, rng)):
+                _add_round_the_middle(layout, window, T_board_cam, (low, high), rng)
         return _shot(window, downscale, T_board_cam, (x, y), layout)
 
     def window(self, rng: np.random.Generator, size: tuple[int, int] = (320, 320), downscale: int = 4) -> Shot:
@@ -229,6 +244,19 @@ def _place_in(
     """A place on the board that the window shows, or would if it were wider and higher by ``beyond_px`` all round."""
     u, v = rng.uniform(-beyond_px, np.array([window.width, window.height]) + beyond_px)
     return board_point(window, T_board_cam, (float(u), float(v)))
+
+
+def _add_round_the_middle(
+    layout: Layout, window: Intrinsics, T_board_cam: Array, reach_px: tuple[float, float], rng: np.random.Generator
+) -> None:
+    """Lay a part so that its centre is that far from the window's middle, where there is room for it."""
+    u, v = (window.width - 1) / 2, (window.height - 1) / 2
+    layout.keep_clear(*board_point(window, T_board_cam, (u, v)), reach_px[0] * T_board_cam[2, 3] / window.fx)
+    for _ in range(_TRIES):
+        distance, direction = rng.uniform(*reach_px), rng.uniform(0, 2 * np.pi)
+        pixel = (float(u + distance * np.cos(direction)), float(v + distance * np.sin(direction)))
+        if layout.add_part(*board_point(window, T_board_cam, pixel)):
+            return
 
 
 def _middle(window: Intrinsics, T_board_cam: Array) -> tuple[float, float]:

@@ -85,6 +85,14 @@ def test_crops_hold_their_first_instance(split: Path) -> None:
     np.testing.assert_array_equal(crops.masks(np.array([2, 0])), masks[[2, 0]])
 
 
+def test_where_no_crop_has_a_target_parts_beside_the_middle_are_none(split: Path) -> None:
+    dataset = json.loads((split / "dataset.json").read_text())
+    (split / "dataset.json").write_text(json.dumps(dataset | {"shots": {"target_share": 0.0}}))
+    crops = load_crops(split)
+    assert not crops.obj_id.any() and not crops.masks().any() and (crops.stable_pose == -1).all()
+    assert len(load_windows(split).obj_id) == 3
+
+
 def test_resting_poses_come_back_from_the_poses(split: Path) -> None:
     labels = load_crops(split).labels(PARTS)
     assert labels.part_index.tolist() == [0, -1, 1]

@@ -170,6 +170,39 @@ def test_no_image_holds_more_parts_than_announced_nor_a_distractor_twice(pool):
             assert len(names) == len(set(names))
 
 
+@pytest.mark.parametrize("touching", [0.0, 0.6])
+def test_round_an_empty_middle_parts_keep_their_distance_from_it(pool, parts, touching):
+    """Those that are pushed against something may end up farther away, never nearer."""
+    low, high = 40, 130
+    ranges = replace(
+        TRAIN_SHOTS,
+        target_share=0.0,
+        neighbours=(0.0, 0.5, 0.5),
+        touching=touching,
+        close=0.0,
+        empty_beside_px=(low, high),
+    )
+    sampler = ShotSampler(pool, ranges)
+    distances = []
+    for shot in shots(lambda rng: sampler.crop(rng, (128, 128), 2), 60):
+        for placed in shot.parts:
+            centre = apply(inverse(shot.T_board_cam), [*footprint(placed, parts)[0], 0.0])
+            distances.append(2 * np.linalg.norm(shot.intrinsics.project(centre) - 63.5))
+    assert len(distances) > 10
+    assert low - 1 < min(distances) and (touching or max(distances) < high + 1)
+
+
+def test_crops_without_parts_beside_their_middle_are_what_they_were(pool):
+    """The range draws nothing where it is not given, so data sets may still grow."""
+    empty = replace(TRAIN_SHOTS, target_share=0.0)
+    beside = replace(empty, empty_beside_px=(40, 130))
+    samplers = [ShotSampler(pool, ranges) for ranges in (empty, beside)]
+    for seed in range(20):
+        one, two = (sampler.crop(np.random.default_rng(seed), (128, 128), 2) for sampler in samplers)
+        assert one.parts == () and one.intrinsics == two.intrinsics
+        assert [d.name for d in one.distractors] == [d.name for d in two.distractors]
+
+
 def test_without_distractors_there_are_none(pool):
     sampler = ShotSampler(pool, others={})
     assert not any(shot.distractors for shot in [*shots(sampler.crop, 30), *frames(sampler, 3)])
@@ -200,6 +233,9 @@ def test_an_area_beyond_the_boards_middle_is_refused(pool):
         {"window_parts": (5, 3)},
         {"scene_crumbs": (-1, 3)},
         {"centre_jitter_px": -1},
+        {"empty_beside_px": (40, 130)},
+        {"empty_beside_px": (0, 10), "target_share": 0.0},
+        {"empty_beside_px": (50, 10), "target_share": 0.0},
     ],
 )
 def test_impossible_settings_are_refused(bad):
