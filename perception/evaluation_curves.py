@@ -11,6 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from scipy.stats import beta, chi2
 
 from cad.spatial import Array
+from perception.bootstrap import clopper_pearson_upper
 from perception.outcomes import SYMMETRIC, Outcome
 from perception.plot_style import BAD, FAINT, colour_of, new_figure, say_empty, step_curve
 
@@ -36,7 +37,7 @@ def risk_coverage(outcomes: Sequence[Outcome]) -> tuple[Array, Array, Array]:
     which something is accepted; before the first right or wrong part there is none.
     """
     wanted = sum(o.whole and o.is_part for o in outcomes)
-    seen = [o for o in outcomes if (o.whole and o.detected) or not o.is_part]
+    seen = [o for o in outcomes if o.whole and (o.detected or not o.is_part)]
     score = np.array([o.score for o in seen], np.float64)
     order = np.argsort(-score, kind="stable")
     false = np.cumsum([not seen[i].is_part for i in order])
@@ -63,7 +64,7 @@ def plot_risk_coverage(rows: Rows) -> Figure:
         accepted = [o for o in parts if o.accepted]
         if accepted:
             bad, n = sum(not o.branch_right_equivalent for o in accepted), len(accepted)
-            most = float(beta.ppf(0.95, bad + 1, n - bad)) if bad < n else 1.0
+            most = clopper_pearson_upper(bad, n)
             said = f"gate: {n / len(parts):.1%} accepted, {bad / n:.2%} wrong (at most {most:.2%})"
             axes.plot(n / len(parts), bad / n, "o", color=colour, mec="black", ms=8, zorder=5, label=said)
     axes.axhline(RISK_WANTED, color=FAINT, linestyle="--", linewidth=1)
@@ -76,7 +77,10 @@ def plot_risk_coverage(rows: Rows) -> Figure:
         xlim=(0.0, 1.005), ylim=(-5e-4, 1.0), xlabel="accepted, of all whole parts", ylabel="wrong, of the accepted"
     )
     axes.grid(color="0.92")
-    axes.legend(loc="upper left", fontsize=8)
+    if axes.lines[:-1]:
+        axes.legend(loc="upper left", fontsize=8)
+    else:
+        say_empty(axes, "no part was found")
     return figure
 
 

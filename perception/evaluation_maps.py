@@ -30,7 +30,7 @@ _PANELS: tuple[tuple[str, Callable[[Outcome], float], Span, Span], ...] = (
 
 def plot_board_map(rows: Rows) -> Figure:
     """Errors of parts on the right branch where they lie on the board; wrong branches and missed parts marked."""
-    figure, grid = new_figure(len(rows), len(_PANELS), (5.4, 3.3), "Errors over the board", sharex=True, sharey=True)
+    figure, grid = new_figure(len(rows), len(_PANELS), (4.8, 3.1), "Errors over the board", sharex=True, sharey=True)
     for row, (method, outcomes) in zip(grid, rows.items(), strict=True):
         parts = _whole(outcomes)
         right = [o for o in parts if o.detected and o.branch_right_equivalent]
@@ -55,7 +55,7 @@ def plot_board_map(rows: Rows) -> Figure:
 
 def plot_light(rows: Rows) -> Figure:
     """Share on the right branch, and errors of those, against how bright a part's surroundings are."""
-    title = "Errors against light: mean grey level round the part"
+    title = "Errors against light: mean grey level round the part (lines: medians)"
     figure, ((share, *panels),) = new_figure(1, 3, (4.3, 3.6), title, sharex=True)
     levels = [o.brightness for outcomes in rows.values() for o in _whole(outcomes)]
     edges = np.unique(np.quantile(levels, np.linspace(0, 1, LIGHT_BINS + 1))) if levels else np.zeros(0)
@@ -92,13 +92,11 @@ def plot_light(rows: Rows) -> Figure:
                 "o-",
                 color=colour,
                 ms=4,
-                label=f"{method}, median",
             )
             axes.set(yscale="log", ylim=span, ylabel=label)
     share.set(ylim=(-0.02, 1.02), ylabel="class, face and yaw branch right")
     share.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{100 * y:.0f} %"))
     share.legend(loc="lower right", fontsize=8)
-    panels[0].legend(loc="upper right", fontsize=8)
     return figure
 
 
@@ -109,7 +107,7 @@ def confusion(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], NDArra
     diagonal, "turned" (right face, wrong yaw branch) and "missed".
     """
     parts = _whole(outcomes)
-    false = [o for o in outcomes if not o.is_part]
+    false = [o for o in outcomes if o.whole and not o.is_part]
     true = {(o.part, o.stable_pose) for o in parts}
     found = {(o.estimated_part, o.estimated_stable_pose) for o in [*parts, *false] if o.estimated_part}
     faces = sorted(true | found)

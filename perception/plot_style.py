@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from cad.files import replacing
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito: for the colour-blind
 METHOD_COLOURS = {"tagcell": COLOURS[0], "pvnet-refined": COLOURS[1], "pvnet": COLOURS[4]}
@@ -59,9 +60,7 @@ def step_curve(axes: Axes, values: Sequence[float], total: int, **style: Any) ->
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a PNG beside ``path`` and rename it, so that a reader never sees half a file; returns the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.part")
-    figure.savefig(aside, format="png")
-    os.replace(aside, path)
+    """Write a PNG; returns the path."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")
     return path

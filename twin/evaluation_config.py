@@ -1,0 +1,77 @@
+"""Configuration of ``tagcell evaluate``: what is evaluated on what."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from scenes.dataset_config import DatasetConfig
+from scenes.domains import DOMAINS
+from scenes.recipes import load_recipe
+from scenes.rests import Faces
+from twin.robot import TwinError
+
+Split = Literal["test", "val"]
+Method = Literal["tagcell", "pvnet"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """What is evaluated on what. Either a ``domain`` of which frames are rendered, or a finished data set, ``data``.
+
+    ``count`` frames, or as many as show each part ``instances`` times; of a data set the first ``count``. Raises
+    TwinError for settings that contradict one another or make no sense.
+    """
+
+    out: Path
+    domain: str | None = None
+    count: int | None = None
+    instances: int | None = None
+    seed: int | None = None
+    faces: Faces | None = None
+    data: Path | None = None
+    split: Split = "test"
+    weights: Path | None = None
+    methods: tuple[Method, ...] = ("tagcell", "pvnet")
+    jobs: int = os.cpu_count() or 1
+
+    def __post_init__(self) -> None:
+        self._check_values()
+        if self.data is None:
+            if self.domain is None:
+                raise TwinError(f"give --domain, one of {', '.join(DOMAINS)}, or a data set with --data")
+            if self.split != "test":
+                raise TwinError(f"--split {self.split} goes with --data only: frames are rendered of split test")
+        else:
+            for name in ("instances", "seed", "faces"):
+                if (value := getattr(self, name)) is not None:
+                    raise TwinError(f"--{name} {value} and --data {self.data}: the data set is as it was rendered")
+        if self.count is not None and self.instances is not None:
+            raise TwinError(f"--count {self.count} and --instances {self.instances}: give one of them")
+
+    def _check_values(self) -> None:
+        for name, least in (("count", 1), ("instances", 1), ("seed", 0), ("jobs", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise TwinError(f"{name} {value}: must be at least {least}")
+        if self.domain is not None and self.domain not in DOMAINS:
+            raise TwinError(f"domain {self.domain!r} is not one of {', '.join(DOMAINS)}")
+        known = get_args(Method)
+        unknown = [m for m in self.methods if m not in known]
+        if unknown or not self.methods:
+            raise TwinError(f"methods {', '.join(unknown) or '(none)'}: choose from {', '.join(known)}")
+
+    @property
+    def frames(self) -> Path:
+        """The data set: the one that was given, or where it is rendered."""
+        return self.data or self.out / "frames"
+
+    def dataset(self) -> DatasetConfig:
+        """The frames to render: those of the domain's recipe, with what was asked for otherwise."""
+        config = load_recipe(f"eval_frames_{self.domain}{'_uniform' if self.faces == 'uniform' else ''}")
+        seed = config.seed + 1000 * (self.seed or 0)
+        if self.instances is not None:
+            return replace(config, seed=seed, count=None, instances=self.instances)
+        return replace(config, seed=seed, count=self.count or config.count)
