@@ -33,7 +33,7 @@ class BopPose:
 
 
 def bop_results_name(method: str, data_set: str, split: str) -> str:
-    """File name by BOP's rule, METHOD_DATASET-SPLIT.csv; underscores inside a name would end it, so they become hyphens."""
+    """File name by BOP's rule, METHOD_DATASET-SPLIT.csv; an underscore inside a name becomes a hyphen."""
     method, data_set = (name.replace("_", "-") for name in (method, data_set))
     return f"{method}_{data_set}-{split}.csv"
 
@@ -68,10 +68,11 @@ def read_bop_results(path: Path) -> list[BopPose]:
             pose = _parsed(line)
         except ValueError as error:
             raise PerceptionError(f"line {number} of {path}: {error}") from error
-        if times.setdefault((pose.scene_id, pose.im_id), pose.time_s) != pose.time_s:
+        before = times.setdefault((pose.scene_id, pose.im_id), pose.time_s)
+        if pose.time_s != before:
             raise PerceptionError(
-                f"line {number} of {path}: time {pose.time_s:g} s, {times[pose.scene_id, pose.im_id]:g} s before; it is "
-                "the time of the whole image, the same in all its lines"
+                f"line {number} of {path}: time {pose.time_s:g} s, in a line before {before:g} s; it is that of the whole "
+                "image, the same in all its lines"
             )
         poses.append(pose)
     return poses

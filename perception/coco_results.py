@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pycocotools import mask as run_lengths
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from cad.files import write_json
-from cad.run_lengths import encode_runs
+from cad.run_lengths import area_of, box_of, encode_runs
 from perception.estimates import NOT_A_PART, FrameEstimate, PerceptionError
 from perception.ground_truth import FrameTruth, GroundTruth
 
@@ -41,7 +40,7 @@ def frame_results(estimate: FrameEstimate, frame: FrameTruth, obj_ids: dict[str,
                 "image_id": frame.image,
                 "category_id": obj_ids[e.part],
                 "segmentation": runs,
-                "bbox": [float(x) for x in run_lengths.toBbox(runs)],
+                "bbox": list(box_of(runs)),
                 "score": float(e.score),
             }
         )
@@ -65,8 +64,8 @@ def coco_ground_truth(truth: GroundTruth) -> dict[str, Any]:
                 "image_id": frame.image,
                 "category_id": part.part.obj_id,
                 "segmentation": part.runs,
-                "area": float(run_lengths.area(part.runs)),
-                "bbox": [float(x) for x in run_lengths.toBbox(part.runs)],
+                "area": area_of(part.runs),
+                "bbox": list(box_of(part.runs)),
                 "iscrowd": int(not part.whole),
             }
             for k, part in enumerate(frame.parts)
@@ -93,7 +92,8 @@ def coco_scores(truth: dict[str, Any], results: Sequence[CocoResult]) -> dict[st
         reference = COCO()
         reference.dataset = truth
         reference.createIndex()
-        evaluation = COCOeval(reference, reference.loadRes([dict(r) for r in results]), "segm")
+        found = reference.loadRes([dict(r) for r in results])  # pyright: ignore[reportArgumentType]
+        evaluation = COCOeval(reference, found, "segm")
         evaluation.params.areaRng, evaluation.params.areaRngLbl = [[0.0, 1e10]], ["all"]
         evaluation.params.maxDets = [MOST_DETECTIONS]
         evaluation.evaluate()

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pycocotools import mask as run_lengths
 
-from cad.parts import Part
-from cad.run_lengths import encode_runs
+from cad.parts import Part, load_part
+from cad.run_lengths import RunLengths, encode_runs, overlaps
 from cad.spatial import Array
 from perception.estimates import NOT_A_PART, FrameEstimate, PartEstimate
 from perception.faces import FaceTable
-from perception.ground_truth import FrameTruth, RunLengths, TruePart, centre_of
+from perception.ground_truth import FrameTruth, TruePart, centre_of
 from perception.metrics import match_detections
 from perception.outcomes import NO_PART, Outcome
 from perception.pose_comparison import (
@@ -37,18 +38,26 @@ SAME_CENTRE_M = 2e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judge:
-    """What all frames of a method have in common: its name, the domain and the parts."""
+    """What all frames of a method have in common: its name, the domain and the faces of the parts that are shown.
+
+    ``parts_dir`` is where a user's own parts are, which a method may see though none is there.
+    """
 
     method: str
     domain: str
     table: FaceTable
+    parts_dir: Path | None = None
+
+    def part(self, name: str) -> Part:
+        """The part of that name."""
+        return load_part(name, self.parts_dir)
 
     def outcomes(self, truth: FrameTruth, image: NDArray[np.uint8], estimate: FrameEstimate) -> list[Outcome]:
         """Rows of a frame: its parts in order, then the detections that belong to none."""
         proposed = [e for e in estimate.parts if e.verdict != NOT_A_PART]
         rejected = [e for e in estimate.parts if e.verdict == NOT_A_PART]
-        parts = {part.name: part for part in self.table.parts}
-        iou = overlaps(proposed, truth)
+        parts = {name: self.part(name) for name in {e.part for e in estimate.parts}}
+        iou = _iou(proposed, truth)
         owner = belonging(proposed, truth, iou, parts)
         rows: list[Outcome] = []
         for g, part in enumerate(truth.parts):
@@ -59,12 +68,12 @@ class Judge:
             else:
                 rows.append(Outcome(**self._about(truth, part, image)))
         missed = {g for g, row in enumerate(rows) if not row.detected}
-        for e, g in zip(rejected, belonging(rejected, truth, overlaps(rejected, truth), parts), strict=True):
+        for e, g in zip(rejected, belonging(rejected, truth, _iou(rejected, truth), parts), strict=True):
             if int(g) in missed:
                 rows[int(g)] = Outcome(
                     **self._about(truth, truth.parts[g], image), **_about_estimate(e), iou=0.0, detected=False
                 )
-        on_cut = on_ignored(proposed, truth)
+        on_cut = on_ignored([runs_of(e, truth) for e in proposed], truth)
         rows += [
             self._stray(truth, image, e, parts[e.part], float(iou[d].max(initial=0.0)), whole=not on_cut[d])
             for d, e in enumerate(proposed)
@@ -72,7 +81,7 @@ class Judge:
         ]
         return rows
 
-    def _about(self, truth: FrameTruth, part: TruePart, image: NDArray[np.uint8]) -> dict:
+    def _about(self, truth: FrameTruth, part: TruePart, image: NDArray[np.uint8]) -> dict[str, Any]:
         centre = centre_of(part.part, part.T_cam_part)
         x_mm, y_mm = truth.on_board_mm(centre)
         return {
@@ -145,14 +154,14 @@ class Judge:
         )
 
 
-def _about_estimate(estimate: PartEstimate) -> dict:
+def _about_estimate(estimate: PartEstimate) -> dict[str, Any]:
     return {
-        "score": estimate.score,
+        "score": float(estimate.score),
         "accepted": estimate.accepted,
         "verdict": estimate.verdict,
         "estimated_part": estimate.part,
-        "estimated_stable_pose": estimate.stable_pose,
-        "details": dict(estimate.details),
+        "estimated_stable_pose": int(estimate.stable_pose),
+        "details": {name: float(value) for name, value in estimate.details.items() if np.isfinite(value)},
     }
 
 
@@ -163,27 +172,14 @@ def runs_of(estimate: PartEstimate, truth: FrameTruth) -> RunLengths:
     return encode_runs(mask, estimate.mask_origin, shape)
 
 
-def overlaps(estimates: Sequence[PartEstimate], truth: FrameTruth) -> Array:
-    """Intersection over union (D, G) of the estimates' masks and the parts' visible pixels."""
-    return _overlaps(estimates, truth, list(truth.parts), of_detection=False)
+def on_ignored(runs: Sequence[RunLengths], truth: FrameTruth) -> NDArray[np.bool_]:
+    """Which masks (D,) lie with half of their pixels on a part that is not whole."""
+    cut = [part.runs for part in truth.parts if not part.whole]
+    return np.asarray((overlaps(runs, cut, of_a=True) >= SAME_IOU).any(axis=1), np.bool_)
 
 
-def on_ignored(estimates: Sequence[PartEstimate], truth: FrameTruth) -> NDArray[np.bool_]:
-    """Which estimates (D,) lie with half of their pixels on a part that is not whole."""
-    cut = [part for part in truth.parts if not part.whole]
-    return np.asarray((_overlaps(estimates, truth, cut, of_detection=True) >= SAME_IOU).any(axis=1), np.bool_)
-
-
-def _overlaps(
-    estimates: Sequence[PartEstimate], truth: FrameTruth, parts: Sequence[TruePart], *, of_detection: bool
-) -> Array:
-    """Shared pixels (D, G) over the union, or over those ``of_detection`` alone."""
-    if not estimates or not parts:
-        return np.zeros((len(estimates), len(parts)))
-    seen = [runs_of(e, truth) for e in estimates]
-    over_own = np.full(len(parts), of_detection, np.uint8)
-    iou = run_lengths.iou(seen, [part.runs for part in parts], over_own)  # pyright: ignore[reportArgumentType]
-    return np.nan_to_num(np.asarray(iou, np.float64))
+def _iou(estimates: Sequence[PartEstimate], truth: FrameTruth) -> Array:
+    return overlaps([runs_of(e, truth) for e in estimates], [part.runs for part in truth.parts])
 
 
 def belonging(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import Part, load_part
+from cad.run_lengths import RunLengths
 from cad.spatial import Array, Intrinsics, apply, inverse
 from perception.bop_files import DATASET, Entry, manifest_hash, read_entries, read_json
 from perception.estimates import Frame, PerceptionError
@@ -24,9 +25,6 @@ WHOLE_FRAMES = "scene"
 IMAGES_A_SCENE = 1000
 """BOP's number of images a folder: an image's number in a data set is 1000 times its folder's plus its own."""
 _SURROUNDINGS_PX = 256
-
-RunLengths = dict[str, Any]
-"""COCO's compressed run lengths: ``size`` [height, width] and ``counts``."""
 
 
 def centre_of(part: Part, T: Array) -> Array:
