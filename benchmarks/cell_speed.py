@@ -26,8 +26,8 @@ from perception.estimates import Frame
 from scenes.gl import mujoco
 from scenes.placement import settle_parts
 from scenes.workcell import CellConfig, build_workcell, set_parts
-from twin.attempts import AttemptFinished, AttemptStarted, Event
 from twin.controller import PickController
+from twin.events import AttemptFinished, AttemptStarted, Event
 from twin.nominal import nominal_calibration
 from twin.oracle import OracleEstimator
 from twin.referee import Referee
@@ -89,7 +89,7 @@ class _Shutter:
     data: mujoco.MjData
     cell: CellConfig
 
-    def capture(self) -> Frame:
+    def capture(self, exposure: float = 1.0) -> Frame:
         image = np.zeros((1, 1, 3), np.uint8)
         return Frame(image=image, intrinsics=self.cell.intrinsics, time_s=float(self.data.time))
 

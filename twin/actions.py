@@ -1,4 +1,4 @@
-"""The motions of a pick: approach, close, check the grip, lift, carry, let go, park.
+"""The motions of a pick: approach, close, check the grip, lift, carry, let go, park; and a push with closed fingers.
 
 Each either does what it says or raises ActionFailed with the reason; a robot's own errors pass through.
 """
@@ -11,6 +11,7 @@ from cad.spatial import Array, transform
 from twin.attempts import Calibration, ControllerConfig, Outcome
 from twin.grasp_choice import GraspChoice
 from twin.ik import ArmIk
+from twin.nudge import Nudge, NudgeConfig
 from twin.profiles import speed_for
 from twin.robot import GripState, Robot, RobotState
 
@@ -29,21 +30,34 @@ class Actions:
     def __init__(self, robot: Robot, ik: ArmIk, calibration: Calibration, config: ControllerConfig) -> None:
         self._robot, self._ik, self._calibration, self._config = robot, ik, calibration, config
 
-    def park(self) -> None:
-        """Bring the arm up and out of the camera's view, straight up first where it is among the parts."""
+    def park(self, q: Array | None = None) -> None:
+        """Bring the arm to ``q`` (6,), out of the camera's view, straight up first where it is among the parts.
+
+        It parks where the calibration says if ``q`` is left out.
+        """
         config = self._config
         T_base_tcp = self._robot.observe().T_base_tcp
         if T_base_tcp[2, 3] < self._board_z + 0.9 * config.hover_m:
             self._line(self._at_height(T_base_tcp, self._carry_z), config.linear_speed, config.linear_acceleration)
-        self._robot.move_j(self._calibration.q_park, speed=config.joint_speed, acceleration=config.joint_acceleration)
+        self._swing(self._calibration.q_park if q is None else q)
+
+    def nudge(self, nudge: Nudge, nudges: NudgeConfig) -> None:
+        """Push with closed fingers, back off, rise."""
+        config = self._config
+        self._grip(0.0, config.open_speed)
+        above = transform(t=[0.0, 0.0, config.hover_m])
+        self._swing(self._ik.solve(above @ nudge.T_base_start))
+        self._down(nudge.T_base_start, config.linear_speed, config.linear_acceleration)
+        self._line(nudge.T_base_end, nudges.speed, nudges.acceleration)
+        self._line(nudge.T_base_back, nudges.speed, nudges.acceleration)
+        self._line(above @ nudge.T_base_back, config.linear_speed, config.linear_acceleration)
 
     def pick(self, T_base_part: Array, choice: GraspChoice) -> float:
         """Approach, close, check, lift to carry height. Returns the opening measured after closing, in metres."""
         config, width = self._config, choice.grasp.width_m
         T_base_tcp = T_base_part @ choice.T_part_tcp
         self._grip(choice.openings_m[0], config.open_speed)
-        q_above = self._ik.solve(transform(t=[0.0, 0.0, config.hover_m]) @ T_base_tcp, choice.q_pick)
-        self._robot.move_j(q_above, speed=config.joint_speed, acceleration=config.joint_acceleration)
+        self._swing(self._ik.solve(transform(t=[0.0, 0.0, config.hover_m]) @ T_base_tcp, choice.q_pick))
         self._down(T_base_tcp, config.linear_speed, config.linear_acceleration)
         closed = self._grip(max(0.0, width - config.overclose_m), config.grip_speed)
         if not self._holds(closed, width):
@@ -88,6 +102,9 @@ class Actions:
 
     def _at_height(self, T_base_tcp: Array, z: float) -> Array:
         return transform(T_base_tcp[:3, :3], [*T_base_tcp[:2, 3], z])
+
+    def _swing(self, q: Array) -> None:
+        self._robot.move_j(q, speed=self._config.joint_speed, acceleration=self._config.joint_acceleration)
 
     def _line(self, T_base_tcp: Array, speed: float, acceleration: float) -> None:
         self._robot.move_l(T_base_tcp, speed=speed, acceleration=acceleration)

@@ -1,4 +1,4 @@
-"""What the controller is told and what it tells: configuration, calibration, attempts and events."""
+"""What a controller is told, and what it tells of each part: configuration, calibration, attempts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from cad import gripper, robot
 from cad.spatial import Array
-from perception.estimates import Frame, FrameEstimate
 from twin.grasp_config import Grasp
 
 Outcome = Literal["placed", "detection", "declined", "pose", "ik", "grasp", "transport", "place", "collision"]
@@ -103,7 +102,8 @@ class Attempt:
     """One try at one part, or a part that was seen and never tried (``tried`` false).
 
     ``T_base_part`` (4, 4) is the estimate brought down to the board plane; ``T_part_tcp`` the grasp as carried out;
-    ``opening_m`` the opening measured after closing; times are the robot's, in seconds.
+    ``opening_m`` the opening measured after closing; ``view`` the kind of look that it was chosen from. Times are the
+    robot's, in seconds; ``look_time_s`` is that of the first look after the attempt before.
     """
 
     part: str
@@ -118,6 +118,7 @@ class Attempt:
     nest: int | None = None
     approach_opening_m: float | None = None
     opening_m: float | None = None
+    view: str = "usual"
     look_time_s: float = 0.0
     start_s: float = 0.0
     end_s: float = 0.0
@@ -126,30 +127,3 @@ class Attempt:
     def T_base_tcp(self) -> Array | None:
         """Tool pose (4, 4) at which the pads close."""
         return None if self.T_part_tcp is None else self.T_base_part @ self.T_part_tcp
-
-
-@dataclass(frozen=True, kw_only=True)
-class Looked:
-    """A frame was taken and understood."""
-
-    frame: Frame
-    estimate: FrameEstimate
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttemptStarted:
-    """The arm is about to move for this attempt, chosen from ``estimate`` of ``frame``."""
-
-    attempt: Attempt
-    frame: Frame
-    estimate: FrameEstimate
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttemptFinished:
-    """The attempt ended; ``attempt.outcome`` says how."""
-
-    attempt: Attempt
-
-
-Event = Looked | AttemptStarted | AttemptFinished

@@ -11,25 +11,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cad.parts import Part
-from cad.resting import as_rest, settled
-from cad.spatial import Array, inverse, rotation_angle
-from perception.estimates import Frame, FrameEstimate, PartEstimate, PerceptionError, PoseEstimator
+from cad.spatial import Array, inverse
+from perception.estimates import Frame, FrameEstimate, PerceptionError, PoseEstimator
 from twin.actions import ActionFailed, Actions
-from twin.attempts import (
-    Attempt,
-    AttemptFinished,
-    AttemptStarted,
-    Calibration,
-    ControllerConfig,
-    Event,
-    Looked,
-    Outcome,
-)
+from twin.attempts import Attempt, Calibration, ControllerConfig, Outcome
+from twin.candidates import Candidate, bring_down
+from twin.events import AttemptFinished, AttemptStarted, Event, Looked, LookedAgain, NudgeFinished, NudgeStarted
 from twin.grasp_choice import GraspChoice, PlacedPart, choose_grasp
 from twin.grasp_config import GraspConfig
 from twin.grasps import describe_grasps
 from twin.ik import ArmIk, IkError
+from twin.nudge import Nudge, plan_nudge
+from twin.park_pose import park_elsewhere
 from twin.robot import Camera, MotionRefused, Robot, RobotError, TwinError
+from twin.second_look import SecondLookConfig, SecondLooks
+from twin.views import USUAL, View
 
 
 class ControllerError(TwinError):
@@ -37,12 +33,13 @@ class ControllerError(TwinError):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Candidate:
-    """An estimate brought down to the board plane, or the reason why it cannot be used."""
+class Seen:
+    """A frame, how it was taken, and what it shows."""
 
-    estimate: PartEstimate
-    placed: PlacedPart
-    problem: tuple[Outcome, str] | None
+    frame: Frame
+    estimate: FrameEstimate
+    view: View
+    candidates: list[Candidate]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +69,7 @@ class PickController:
         calibration: Calibration,
         config: ControllerConfig | None = None,
         grasp_config: GraspConfig | None = None,
+        second_look: SecondLookConfig | None = None,
         on_event: Callable[[Event], None] | None = None,
     ) -> None:
         missing = sorted(set(parts) - set(calibration.T_base_nests))
@@ -85,71 +83,104 @@ class PickController:
         self._in_nests: dict[str, dict[int, PlacedPart]] = {name: {} for name in parts}
         self._tries: list[Array] = []
         self._actions = Actions(robot, ik, calibration, self._config)
+        self._q_elsewhere, self._parked_elsewhere = park_elsewhere(ik, calibration), False
+        self._second = SecondLooks(second_look or SecondLookConfig(), elsewhere=self._q_elsewhere is not None)
+        self._since_s: float | None = None
         self.attempts: list[Attempt] = []
 
     def run(self) -> list[Attempt]:
         """Look and pick until nothing is left that can be picked; returns every attempt and every part left behind.
 
-        Raises RobotError when the robot stops by itself in a move: somebody has to look at it first.
+        What the estimator is unsure of is looked at again in other ways before it is left behind, once there is nothing
+        else to pick. Raises RobotError when the robot stops by itself in a move: somebody has to look at it first.
         """
         self._actions.park()
-        idle, left_behind = 0, []
+        idle, left_behind, view, again = 0, [], USUAL, None
         for _ in range(self._config.max_looks):
-            seen = self._look()
-            plan, left_behind = self._choose(seen[1]) if seen else (None, left_behind)
+            seen = self._look(view) if again is None else self._look_again(again, view)
+            plan, left_behind = self._choose(seen.candidates) if seen else (None, left_behind)
+            again = None
             if seen and plan:
                 idle = 0
-                self._attempt(plan, *seen)
+                self._attempt(plan, seen)  # from a view that shows what can be picked: the next look is of it, too
+                continue
+            again = self._second.next(view, seen.candidates, self._plan_nudge) if seen else None
+            if again is not None:
+                view = again if isinstance(again, View) else USUAL
                 continue
             idle += 1
-            if idle >= self._config.idle_looks or (seen and not left_behind):
+            if view == USUAL and (idle >= self._config.idle_looks or (seen and not left_behind)):
                 break
+            view = USUAL
         self.attempts += left_behind
         return self.attempts
 
     # -- look -----------------------------------------------------------------------------------------------------
 
-    def _look(self) -> tuple[Frame, FrameEstimate] | None:
+    def _look(self, view: View) -> Seen | None:
         """A frame taken now and what it shows; None when the frame cannot be used."""
-        frame = self._camera.capture()
+        if view.elsewhere != self._parked_elsewhere:
+            self._park(elsewhere=view.elsewhere)
+        frame = self._camera.capture(view.exposure)
+        if self._since_s is None:
+            self._since_s = frame.time_s
         try:
             estimate = self._estimator.estimate(frame)
         except PerceptionError:
             return None
-        self._on_event(Looked(frame=frame, estimate=estimate))
-        return frame, estimate
-
-    def _candidates(self, estimate: FrameEstimate) -> list[Candidate]:
+        self._on_event(Looked(frame=frame, estimate=estimate, view=str(view)))
         T_base_cam = self._calibration.T_base_board @ inverse(estimate.T_cam_board)
-        return [self._candidate(part, T_base_cam) for part in estimate.parts if part.part in self._parts]
+        candidates = [
+            bring_down(seen, self._parts[seen.part], T_base_cam, self._calibration, self._config)
+            for seen in estimate.parts
+            if seen.part in self._parts
+        ]
+        return Seen(frame=frame, estimate=estimate, view=view, candidates=self._second.take_in(view, candidates))
 
-    def _candidate(self, estimate: PartEstimate, T_base_cam: Array) -> Candidate:
-        """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's."""
-        part, T_base_board = self._parts[estimate.part], self._calibration.T_base_board
-        pose = part.stable_poses[estimate.stable_pose]
-        T_board_part = as_rest(part, pose, inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part)
-        flat = settled(pose, T_board_part)
-        tilt = rotation_angle(flat[:3, :3], T_board_part[:3, :3])
-        x, y = flat[:2, 3] - (flat[:3, :3] @ pose.R_table_part.T @ pose.t_table_part)[:2]
-        off = T_board_part[2, 3] - flat[2, 3]
-        problem: tuple[Outcome, str] | None = None
-        if not estimate.accepted:
-            problem = "declined", estimate.verdict
-        elif tilt > self._config.plane_tolerance or abs(off) > self._config.plane_tolerance_m:
-            problem = (
-                "pose",
-                f"{1e3 * off:.2f} mm off the board and {np.degrees(tilt):.1f} degrees from its stable pose",
-            )
-        elif abs(x) > self._calibration.board_half_m[0] or abs(y) > self._calibration.board_half_m[1]:
-            problem = "pose", f"at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm on the board, outside the pick area"
-        placed = PlacedPart(part=part, T_base_part=T_base_board @ flat)
-        return Candidate(estimate=estimate, placed=placed, problem=problem)
+    def _look_again(self, again: View | Nudge, view: View) -> Seen | None:
+        """Another look at what is in doubt, after a push if it takes one, and an account of it."""
+        start_s, unsure = self._robot.observe().time_s, self._second.unsure
+        if isinstance(again, Nudge):
+            self._nudge(again)
+        seen = self._look(view)
+        seconds = self._robot.observe().time_s - start_s
+        self._second.looked(seconds)
+        accepted = self._second.accepted if seen else 0
+        kind = "nudge" if isinstance(again, Nudge) else again.kind
+        self._on_event(LookedAgain(kind=kind, unsure=unsure, accepted=accepted, seconds=seconds))
+        return seen
+
+    def _nudge(self, nudge: Nudge) -> None:
+        self._on_event(NudgeStarted(nudge=nudge))
+        note = ""
+        try:
+            self._actions.nudge(nudge, self._second.config.nudge)
+        except (MotionRefused, IkError) as refusal:
+            note = str(refusal)
+        self._second.pushed(nudge)
+        try:
+            self._park()
+        finally:
+            self._on_event(NudgeFinished(nudge=nudge, note=note))
+
+    def _plan_nudge(self, target: Candidate, others: list[Candidate]) -> Nudge | str:
+        return plan_nudge(
+            target,
+            others,
+            radius_m=max(part.radius_m for part in self._parts.values()),
+            solve=self._ik.solve,
+            calibration=self._calibration,
+            config=self._second.config.nudge,
+        )
+
+    def _park(self, *, elsewhere: bool = False) -> None:
+        self._actions.park(self._q_elsewhere if elsewhere else None)
+        self._parked_elsewhere = elsewhere
 
     # -- choose ---------------------------------------------------------------------------------------------------
 
-    def _choose(self, estimate: FrameEstimate) -> tuple[Plan | None, list[Attempt]]:
+    def _choose(self, candidates: list[Candidate]) -> tuple[Plan | None, list[Attempt]]:
         """The next part to pick, least tried and surest first, and what cannot be picked and why."""
-        candidates = self._candidates(estimate)
         left_behind: list[Attempt] = []
         for candidate in sorted(candidates, key=lambda c: (self._tries_at(c.placed), -c.estimate.score)):
             problem = candidate.problem
@@ -206,9 +237,10 @@ class PickController:
 
     # -- pick and place -------------------------------------------------------------------------------------------
 
-    def _attempt(self, plan: Plan, frame: Frame, estimate: FrameEstimate) -> None:
+    def _attempt(self, plan: Plan, seen: Seen) -> None:
         """Pick the planned part and place it, and say how that ended."""
         placed, choice = plan.candidate.placed, plan.choice
+        self._second.forget(plan.candidate.centre)
         self._tries.append(placed.T_base_part[:2, 3].copy())
         attempt = Attempt(
             part=placed.part.name,
@@ -219,10 +251,12 @@ class PickController:
             T_part_tcp=choice.T_part_tcp,
             nest=plan.nest,
             approach_opening_m=choice.openings_m[0],
-            look_time_s=frame.time_s,
+            view=str(seen.view),
+            look_time_s=seen.frame.time_s if self._since_s is None else self._since_s,
             start_s=self._robot.observe().time_s,
         )
-        self._on_event(AttemptStarted(attempt=attempt, frame=frame, estimate=estimate))
+        self._since_s = None
+        self._on_event(AttemptStarted(attempt=attempt, frame=seen.frame, estimate=seen.estimate))
         try:
             attempt = replace(attempt, opening_m=self._actions.pick(placed.T_base_part, choice))
             self._actions.carry(plan.T_base_part_at_nest, choice)
@@ -238,7 +272,7 @@ class PickController:
             self._finish(replace(attempt, outcome="collision", note=str(error)))
             raise
         try:
-            self._actions.park()
+            self._park()
         finally:
             self._finish(attempt)
 

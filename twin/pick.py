@@ -74,7 +74,7 @@ def config_json(config: PickConfig) -> dict[str, Any]:
     for name in ("out", "jobs", "pictures", "parts_dir"):
         del values[name]
     paths = {name: str(values[name]) if values[name] else None for name in ("arm_calibration", "weights")}
-    return values | paths | {"parts": list(config.parts)}
+    return values | paths | {name: list(values[name]) for name in ("parts", "second_looks")}
 
 
 def check_weights(config: PickConfig) -> dict[str, str]:

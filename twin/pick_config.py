@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from cad.parts import BUILT_IN, part_names
+from twin.views import LookKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +29,8 @@ class PickConfig:
     """Seed of the scenes; the same seed gives the same scorecard."""
     estimator: Literal["learned", "oracle"] = "learned"
     """Who says where the parts are: the trained networks, or ground truth."""
+    second_looks: tuple[LookKind, ...] = ("exposure", "park", "nudge")
+    """Other looks at what the estimator is unsure of, in this order; give the option without a value for none."""
     weights: Path | None = None
     """Folder of trained weights; the ones that come with Tagcell when left out."""
     out: Path = Path("runs/pick")
@@ -50,5 +53,7 @@ class PickConfig:
             raise ValueError(
                 f"unknown part {', '.join(unknown) or '(none given)'}; parts there are: {', '.join(known)}"
             )
+        if len(set(self.second_looks)) != len(self.second_looks):
+            raise ValueError(f"second-looks are {', '.join(self.second_looks)}; name each kind once")
         if len(set(self.parts)) != len(self.parts):
             raise ValueError(f"parts are {', '.join(self.parts)}; name each class once and use parts-per-class")

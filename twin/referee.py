@@ -3,9 +3,10 @@
 It never asks the controller anything; the controller's only influence is to mark where one attempt ends and the next
 begins. Rules (names and numbers): a part is *picked* when both pads held it, lowest point at least 50 mm above the
 board, for 1 s of simulated time; *placed* when at rest in a nest of its class within 0.3 mm and 3 degrees (modulo its
-proper symmetries, and its roll where it is round), same face down as it was presented; it *succeeded* when picked and
+proper symmetries, and its roll where it is round), same face down as it was picked; it *succeeded* when picked and
 placed, no other part moved by more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything
-but the part, the board under it and the nest.
+but the part, the board under it and the nest. A part may be pushed before it is picked: a *nudge* is judged like an
+attempt, may move and touch nothing but that part, and leaves it presented anew, as it then lies.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class PartRecord:
     T_world_presented: Array
     stable_pose: int
     attempts: int = 0
+    nudges: int = 0
     gripped: bool = False
     picked: bool = False
     placed: bool = False
@@ -96,16 +98,16 @@ class Referee:
         self._timestep_s, self._next_look_s, self._contact_count = float(model.opt.timestep), -np.inf, -1
         self._held_since = np.full(len(parts), np.nan)
         self._held_last = np.full(len(parts), -np.inf)
-        self._open = False
+        self._open = self._nudging = False
 
     def poses(self) -> Array:
         """``T_world_part`` (N, 4, 4) of all part instances now."""
         return np.array([self._pose(i) for i in range(len(self._parts))])
 
-    def begin_attempt(self) -> None:
-        """Close the attempt before, if any, and open a new one."""
+    def begin_attempt(self, *, nudge: bool = False) -> None:
+        """Close the attempt before, if any, and open a new one, or a ``nudge``: a push that is not meant to pick."""
         self._close_attempt()
-        self._open = True
+        self._open, self._nudging = True, nudge
         self._start = self.poses()
         self._gripped: list[int] = []
         self._touched: set[int] = set()
@@ -200,7 +202,11 @@ class Referee:
         if target is None:
             return
         record = self.records[target]
-        record.attempts += 1
+        if self._nudging and not self._gripped:
+            record.nudges += 1
+            record.T_world_presented, record.stable_pose = self._lies(target)
+        else:
+            record.attempts += 1
         record.disturbed += [f"part_{i:02d}" for i in moved]
         record.collisions += [f"part_{i:02d}" for i in sorted(self._touched - {target})]
         record.collisions += self._forbidden(target)
@@ -244,9 +250,13 @@ class Referee:
         record.placed = bool(at_rest and errors[n][0] <= self._rules.place_m and errors[n][1] <= self._rules.place_rad)
 
     def _present(self, i: int) -> PartRecord:
+        T, stable_pose = self._lies(i)
+        return PartRecord(part=self._parts[i].name, instance=i, T_world_presented=T, stable_pose=stable_pose)
+
+    def _lies(self, i: int) -> tuple[Array, int]:
+        """``T_world_part`` (4, 4) and the index of the stable pose that it is nearest to."""
         T = self._pose(i)
-        pose, _ = nearest_rest(self._parts[i], T[:3, :3])
-        return PartRecord(part=self._parts[i].name, instance=i, T_world_presented=T, stable_pose=pose.index)
+        return T, nearest_rest(self._parts[i], T[:3, :3])[0].index
 
     def _pose(self, i: int) -> Array:
         body = self._bodies[i]

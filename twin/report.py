@@ -102,4 +102,8 @@ def print_scorecard(card: dict[str, Any], out: Path) -> None:
         f"place error mean {_number(place['e_mm']['mean'])} mm, p95 {_number(place['e_mm']['p95'])} mm; "
         f"cycle {_number(card['cycle_s']['mean'], 2)} s simulated, {card['picks_per_hour']:.0f} picks an hour"
     )
+    for kind, row in card["second_looks"].items():
+        console.print(
+            f"second looks, {kind}: {row['looks']} in {row['seconds']:.1f} s simulated, {row['accepted']} accepted"
+        )
     console.print(f"{out / 'scorecard.json'}", soft_wrap=True)

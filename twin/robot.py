@@ -94,6 +94,6 @@ class Robot(Protocol):
 class Camera(Protocol):
     """A camera that looks at the board."""
 
-    def capture(self) -> Frame:
-        """A fresh frame, exposed after the call."""
+    def capture(self, exposure: float = 1.0) -> Frame:
+        """A fresh frame, exposed after the call for ``exposure`` times the camera's usual exposure time."""
         ...

@@ -12,7 +12,7 @@ import numpy as np
 from cad.parts import Part, load_part
 from cad.robot import JOINT_NAMES
 from cad.spatial import Array, inverse, rotation_from_rotvec, transform
-from perception.estimates import Frame, FrameEstimate, PoseEstimator
+from perception.estimates import PoseEstimator
 from perception.overlay import save_picture
 from scenes.camera import camera_pose, set_camera_pose
 from scenes.classic import ClassicRenderer
@@ -20,8 +20,9 @@ from scenes.gl import mujoco
 from scenes.placement import settle_parts
 from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.assessment import Beliefs, assess, centre, match, pose_error
-from twin.attempts import Attempt, AttemptFinished, AttemptStarted, Event, Looked
+from twin.attempts import Attempt
 from twin.controller import PickController
+from twin.events import AttemptFinished, AttemptStarted, Event, Looked, LookedAgain, NudgeStarted
 from twin.nominal import nominal_calibration
 from twin.oracle import OracleEstimator
 from twin.pick_config import PickConfig
@@ -29,8 +30,10 @@ from twin.pictures import annotate, grasp_in_camera
 from twin.referee import Referee
 from twin.robot import RobotError
 from twin.scorecard import SceneResult
+from twin.second_look import SecondLookConfig
 from twin.sim_camera import SimCamera
 from twin.sim_robot import SimRobot
+from twin.views import USUAL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +96,9 @@ class SceneTrial:
         self._beliefs = [Beliefs() for _ in self._parts]
         self._target: int | None = None
         self._cycles: list[float] = []
+        self._again: list[LookedAgain] = []
         self._cycle_start, self._looked_once = 0.0, False
-        self._pending: tuple[Frame, FrameEstimate] | None = None
+        self._pending: Looked | None = None
         self._watch.lap("build")
 
     def run(self, on_attempt: Callable[[Attempt], None] | None = None) -> SceneResult:
@@ -107,6 +111,7 @@ class SceneTrial:
             ik=self._robot.ik,
             parts=self._classes,
             calibration=nominal_calibration(self._cell, list(self._classes)),
+            second_look=SecondLookConfig(looks=self._config.second_looks),
             on_event=self._on_event,
         )
         try:
@@ -133,6 +138,7 @@ class SceneTrial:
             parts=tuple(results),
             cycle_s=tuple(self._cycles),
             retries=sum(a.tried and a.number > 1 for a in attempts),
+            looked_again=tuple(self._again),
             wall_s=self._watch.seconds,
         )
 
@@ -145,12 +151,17 @@ class SceneTrial:
         match event:
             case Looked():
                 self._watch.lap("look")
-                self._looked(event.frame, event.estimate)
+                self._looked(event)
+            case LookedAgain():
+                self._again.append(event)
+            case NudgeStarted():
+                self._referee.begin_attempt(nudge=True)
+                self._draw_pending(event.nudge.T_base_start)
             case AttemptStarted():
                 self._referee.begin_attempt()
                 self._target = self._nearest(event.attempt.T_base_part, event.attempt.part)
                 self._cycle_start = event.attempt.look_time_s
-                self._draw_pending(event.attempt)
+                self._draw_pending(event.attempt.T_base_tcp, event.attempt.approach_opening_m or 0.0)
             case AttemptFinished():
                 if self._target is not None:
                     self._beliefs[self._target].attempts.append(event.attempt)
@@ -159,29 +170,31 @@ class SceneTrial:
                 self._on_attempt(event.attempt)
                 self._watch.lap("robot")
 
-    def _looked(self, frame: Frame, estimate: FrameEstimate) -> None:
+    def _looked(self, look: Looked) -> None:
         if not self._looked_once:
             self._looked_once = True
             T_cam_parts = inverse(camera_pose(self._model, self._data)) @ self._referee.poses()
-            found = match(estimate.parts, self._classes, self._parts, T_cam_parts)
+            found = match(look.estimate.parts, self._classes, self._parts, T_cam_parts)
             for i, seen in found.items():
                 self._beliefs[i].estimate = seen
                 self._beliefs[i].error = pose_error(self._parts[i], T_cam_parts[i], seen)
         self._draw_pending()
-        self._pending = frame, estimate
+        self._pending = look
         self._watch.lap("pictures")
 
-    def _draw_pending(self, attempt: Attempt | None = None) -> None:
-        """Save the picture of the last look, with the grasp it led to if it led to one."""
+    def _draw_pending(self, T_base_tcp: Array | None = None, opening_m: float = 0.0) -> None:
+        """Save the picture of the last look, with the grasp or the push that it led to if it led to one."""
         if self._pending is None or not self._config.pictures:
             return
-        (frame, estimate), self._pending = self._pending, None
-        chosen, opening = None, 0.0
-        if attempt is not None and attempt.T_base_tcp is not None:
-            chosen = grasp_in_camera(attempt.T_base_tcp, self._cell.T_world_board, estimate.T_cam_board)
-            opening = attempt.approach_opening_m or 0.0
-        name = f"scene_{self._scene:03d}_time_{frame.time_s:07.2f}.jpg"
-        save_picture(self._config.out / "frames" / name, annotate(frame, estimate, self._classes, chosen, opening))
+        look, self._pending = self._pending, None
+        chosen = None
+        if T_base_tcp is not None:
+            chosen = grasp_in_camera(T_base_tcp, self._cell.T_world_board, look.estimate.T_cam_board)
+        view = "" if look.view == str(USUAL) else f"_{look.view.replace(' ', '_')}"
+        name = f"scene_{self._scene:03d}_time_{look.frame.time_s:07.2f}{view}.jpg"
+        save_picture(
+            self._config.out / "frames" / name, annotate(look.frame, look.estimate, self._classes, chosen, opening_m)
+        )
         self._watch.lap("pictures")
 
     def _nearest(self, T_world_part: Array, name: str) -> int | None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
+from twin.events import LookedAgain
 from twin.robot import TwinError
 
 FAILURES = ("detection", "declined", "pose", "ik", "grasp", "transport", "place", "disturbed", "collision")
@@ -54,12 +55,13 @@ class PartResult:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneResult:
-    """One scene: its parts, the simulated time of each pick cycle and wall time by stage."""
+    """One scene: its parts, the simulated time of each pick cycle, second looks and wall time by stage."""
 
     scene: int
     parts: tuple[PartResult, ...]
     cycle_s: tuple[float, ...]
     retries: int
+    looked_again: tuple[LookedAgain, ...] = ()
     wall_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -92,6 +94,19 @@ def pose_error_table(errors: Sequence[tuple[str, PoseError]]) -> dict[str, Any]:
         }
         table[name]["branch_right"] = float(np.mean([e.branch_right for e in rows])) if rows else None
         table[name]["class_right"] = float(np.mean([e.class_right for e in rows])) if rows else None
+    return table
+
+
+def second_look_table(looks: Sequence[LookedAgain]) -> dict[str, dict[str, float]]:
+    """By kind: ``looks`` taken, parts ``accepted`` by them, and the ``seconds`` of simulated time they took."""
+    table: dict[str, dict[str, float]] = {}
+    for kind in sorted({look.kind for look in looks}):
+        rows = [look for look in looks if look.kind == kind]
+        table[kind] = {
+            "looks": len(rows),
+            "accepted": sum(look.accepted for look in rows),
+            "seconds": sum(look.seconds for look in rows),
+        }
     return table
 
 
@@ -137,6 +152,7 @@ def build_scorecard(
             for name in ["all", *sorted({p for p, _ in placed})]
         },
         "cycle_s": {k: cycles[k] for k in ("mean", "median", "p95")} | {"p50": cycles["median"]},
+        "second_looks": second_look_table([look for s in scenes for look in s.looked_again]),
         "picks_per_hour": 3600.0 / cycles["mean"] if cycles["mean"] else 0.0,
         "wall_s": {k: sum(s.wall_s.get(k, 0.0) for s in scenes) for k in stages},
         "config": config,

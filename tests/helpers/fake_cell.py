@@ -109,10 +109,11 @@ class FakeRobot:
 
 class FakeCamera:
     def __init__(self, robot):
-        self.robot = robot
+        self.robot, self.exposures = robot, []
 
-    def capture(self):
+    def capture(self, exposure=1.0):
         self.robot.time_s += 1.0
+        self.exposures.append(exposure)
         return Frame(image=np.zeros((1, 1, 3), np.uint8), intrinsics=BASLER, time_s=self.robot.time_s)
 
 
@@ -145,15 +146,16 @@ PLACES = ((0.03, 0.01, 0.4), (-0.04, -0.02, 2.0), (0.0, 0.03, -1.0))
 class World:
     """A robot, a camera and an estimator around boxes lying at ``places`` on the board."""
 
-    def __init__(self, part, places=PLACES, change=None, **config):
+    def __init__(self, part, places=PLACES, change=None, second_look=None, **config):
         resting = part.stable_poses[0].T_table_part
         self.part, self.events = part, []
         self.parts = [FakePart(part, BOARD @ planar(*place) @ resting) for place in places]
         self.robot = FakeRobot(self.parts)
         self.estimator = FakeEstimator(self.parts, change)
+        self.camera = FakeCamera(self.robot)
         self.controller = PickController(
             self.robot,
-            FakeCamera(self.robot),
+            self.camera,
             self.estimator,
             ik=IK,
             parts={"brick": part},
@@ -164,6 +166,7 @@ class World:
                 board_half_m=(0.08, 0.05),
             ),
             config=ControllerConfig(**config),
+            second_look=second_look,
             on_event=self.events.append,
         )
 

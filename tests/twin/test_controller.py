@@ -8,10 +8,12 @@ import pytest
 from fake_cell import BOARD, CELL, IK, NESTS, PLACES, FakeCamera, FakeEstimator, FakeRobot, World
 
 from cad.spatial import inverse, rotation_angle, rotation_x, transform
-from twin.attempts import OUTCOMES, AttemptFinished, AttemptStarted, Calibration, ControllerConfig, Looked
+from twin.attempts import OUTCOMES, Calibration, ControllerConfig
 from twin.controller import ControllerError, PickController
+from twin.events import AttemptFinished, AttemptStarted, Looked
 from twin.grasp_config import GraspError
 from twin.robot import RobotError
+from twin.second_look import SecondLookConfig
 
 
 def test_every_part_ends_in_a_nest_of_its_own(brick):
@@ -82,7 +84,7 @@ def test_a_part_lost_on_the_way_is_a_transport_failure(brick):
 
 
 def test_what_is_declined_is_not_touched(brick):
-    world = World(brick, change=lambda e: replace(e, verdict="too blurred"))
+    world = World(brick, change=lambda e: replace(e, verdict="too blurred"), second_look=SecondLookConfig(looks=()))
     attempts = world.run()
     assert [(a.outcome, a.note, a.tried) for a in attempts] == [("declined", "too blurred", False)] * 3
     assert all(T[2, 3] > 0.06 for T in world.robot.moves)

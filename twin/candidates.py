@@ -1,0 +1,56 @@
+"""Estimates as a controller uses them: brought down to the board, with what speaks against picking them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cad.parts import Part
+from cad.resting import as_rest, settled
+from cad.spatial import Array, apply, inverse, rotation_angle
+from perception.estimates import NOT_A_PART, OTHER_PART, PartEstimate
+from twin.attempts import Calibration, ControllerConfig, Outcome
+from twin.grasp_choice import PlacedPart
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """An estimate brought down to the board plane, and the reason why it cannot be used, if there is one."""
+
+    estimate: PartEstimate
+    placed: PlacedPart
+    problem: tuple[Outcome, str] | None = None
+
+    @cached_property
+    def centre(self) -> Array:
+        """Middle of the part's bounding box seen from above (2,), in ``base``."""
+        return apply(self.placed.T_base_part, self.placed.part.mesh.bounds.mean(axis=0))[:2]
+
+    @property
+    def unsure(self) -> bool:
+        """Whether another look may make a part of it that can be picked."""
+        declined = self.problem is not None and self.problem[0] == "declined"
+        return declined and self.estimate.verdict not in (NOT_A_PART, OTHER_PART)
+
+
+def bring_down(
+    estimate: PartEstimate, part: Part, T_base_cam: Array, calibration: Calibration, config: ControllerConfig
+) -> Candidate:
+    """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's."""
+    pose, T_base_board = part.stable_poses[estimate.stable_pose], calibration.T_base_board
+    T_board_part = as_rest(part, pose, inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part)
+    flat = settled(pose, T_board_part)
+    tilt = rotation_angle(flat[:3, :3], T_board_part[:3, :3])
+    x, y = flat[:2, 3] - (flat[:3, :3] @ pose.R_table_part.T @ pose.t_table_part)[:2]
+    off = T_board_part[2, 3] - flat[2, 3]
+    problem: tuple[Outcome, str] | None = None
+    if not estimate.accepted:
+        problem = "declined", estimate.verdict
+    elif tilt > config.plane_tolerance or abs(off) > config.plane_tolerance_m:
+        problem = "pose", f"{1e3 * off:.2f} mm off the board and {np.degrees(tilt):.1f} degrees from its stable pose"
+    elif abs(x) > calibration.board_half_m[0] or abs(y) > calibration.board_half_m[1]:
+        problem = "pose", f"at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm on the board, outside the pick area"
+    placed = PlacedPart(part=part, T_base_part=T_base_board @ flat)
+    return Candidate(estimate=estimate, placed=placed, problem=problem)
