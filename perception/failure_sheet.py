@@ -5,7 +5,8 @@ An arrow along the part's x axis, of the silhouette's colour, tells poses apart 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,10 @@ from cad.files import replacing
 from cad.parts import Part
 from cad.spatial import Array, Intrinsics, apply
 from perception.estimates import Frame
+from perception.evaluate import Found, FrameRecord, outcomes_of
+from perception.failure_kinds import KINDS, failure_kind, worst_failures
+from perception.ground_truth import FrameTruth, GroundTruth
+from perception.outcomes import Outcome
 from perception.silhouette import silhouette_mask
 
 Image = NDArray[np.uint8]
@@ -94,6 +99,47 @@ def write_failure_sheet(path: Path, title: str, tiles: Sequence[Image]) -> None:
     with replacing(path) as temporary:
         if not cv2.imwrite(str(temporary), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
             raise OSError(f"cannot write the picture {path}")
+
+
+def write_failures(path: Path, truth: GroundTruth, records: Sequence[FrameRecord], most: int = 48) -> None:
+    """Show the worst failures of one method, all of ``truth``'s frames in ``records``: ``most`` of them, each kind."""
+    outcomes = outcomes_of(records)
+    frames = {frame.image: frame for frame in truth.frames}
+    poses = {record.image: record.poses for record in records}
+    parts = {part.name: part for part in truth.parts}
+    worst = worst_failures(outcomes, most)
+    tiles: dict[int, Image] = {}
+    for image in sorted({outcome.image for _, outcome in worst}):
+        frame = frames[image].frame()
+        for k, (kind, outcome) in enumerate(worst):
+            if outcome.image == image:
+                failure = _failure(kind, outcome, frames[image], poses[image], parts)
+                tiles[k] = failure_tile(frame, failure)
+    counts = Counter(kind for o in outcomes if (kind := failure_kind(o)) is not None)
+    said = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
+    shown = "" if len(worst) == counts.total() else f" ({len(worst)} shown)"
+    method, n = records[0].method, sum(o.whole and o.is_part for o in outcomes)
+    title = f"{method}, {truth.domain}, {n} parts: {said}{shown}" if said else f"{method}, {truth.domain}, {n} parts"
+    write_failure_sheet(path, title, [tiles[k] for k in sorted(tiles)])
+
+
+def _failure(
+    kind: str, outcome: Outcome, frame: FrameTruth, poses: Sequence[Found], parts: Mapping[str, Part]
+) -> Failure:
+    """What is to be drawn of an outcome; its pose is the one of its class and score."""
+    true = [p for p in frame.parts if p.number == outcome.instance]
+    seen = parts.get(outcome.estimated_part)
+    found = [p for p in poses if seen is not None and (p.obj_id, p.score) == (seen.obj_id, outcome.score)]
+    was = f"{outcome.part} {outcome.stable_pose}" if true else "no part"
+    told = f"{outcome.estimated_part} {outcome.estimated_stable_pose}" if seen else "nothing"
+    where = f"image {outcome.image}" + (f" instance {outcome.instance}" if true else "")
+    verdict = f"{outcome.verdict} {outcome.score:.2f}" if seen else f"{outcome.visible_share:.0%} visible"
+    return Failure(
+        caption=(f"{kind}: {was}, taken for {told}", f"{where}, {verdict}"),
+        accepted=outcome.accepted,
+        true=PosedPart(part=true[0].part, T_cam_part=true[0].T_cam_part) if true else None,
+        estimated=PosedPart(part=seen, T_cam_part=found[0].T_cam_part) if seen and found else None,
+    )
 
 
 def _window(image: Image, u: int, v: int, side: int) -> Image:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-from scenes.dataset_config import DatasetConfig
-from scenes.domains import DOMAINS
-from scenes.recipes import load_recipe
-from scenes.rests import Faces
+from twin.render_cli import Domain, Faces
 from twin.robot import TwinError
 
+if TYPE_CHECKING:
+    from scenes.dataset_config import DatasetConfig
+
+DOMAINS = get_args(Domain)
 Split = Literal["test", "val"]
 Method = Literal["tagcell", "pvnet"]
 
@@ -34,6 +35,8 @@ class EvaluationConfig:
     data: Path | None = None
     split: Split = "test"
     weights: Path | None = None
+    part: tuple[str, ...] = ()
+    parts_dir: Path | None = None
     methods: tuple[Method, ...] = ("tagcell", "pvnet")
     jobs: int = os.cpu_count() or 1
 
@@ -45,9 +48,10 @@ class EvaluationConfig:
             if self.split != "test":
                 raise TwinError(f"--split {self.split} goes with --data only: frames are rendered of split test")
         else:
-            for name in ("instances", "seed", "faces"):
-                if (value := getattr(self, name)) is not None:
-                    raise TwinError(f"--{name} {value} and --data {self.data}: the data set is as it was rendered")
+            for name in ("instances", "seed", "faces", "part"):
+                if value := getattr(self, name):
+                    said = " ".join(value) if name == "part" else value
+                    raise TwinError(f"--{name} {said} and --data {self.data}: the data set is as it was rendered")
         if self.count is not None and self.instances is not None:
             raise TwinError(f"--count {self.count} and --instances {self.instances}: give one of them")
 
@@ -70,8 +74,11 @@ class EvaluationConfig:
 
     def dataset(self) -> DatasetConfig:
         """The frames to render: those of the domain's recipe, with what was asked for otherwise."""
+        from scenes.recipes import load_recipe
+
         config = load_recipe(f"eval_frames_{self.domain}{'_uniform' if self.faces == 'uniform' else ''}")
         seed = config.seed + 1000 * (self.seed or 0)
+        config = replace(config, seed=seed, parts=self.part, parts_dir=self.parts_dir)
         if self.instances is not None:
-            return replace(config, seed=seed, count=None, instances=self.instances)
-        return replace(config, seed=seed, count=self.count or config.count)
+            return replace(config, count=None, instances=self.instances)
+        return replace(config, count=self.count or config.count)

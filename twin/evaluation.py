@@ -1,0 +1,143 @@
+"""``tagcell evaluate``: frames that perception has never seen, every method on each of them, and all that comes of it.
+
+Frames, and what each method makes of a frame, are kept as soon as they are finished; the same command goes on from
+there. Tables, plots and pictures follow from what is kept.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cad.parts import hash_file
+from perception.bop_files import DATASET, manifest_hash, read_json
+from perception.bop_results import bop_results_name, write_bop_results
+from perception.coco_results import write_coco_results
+from perception.estimates import PerceptionError, PoseEstimator
+from perception.evaluate import FrameRecord, Progress, evaluate, outcomes_of, record_path
+from perception.evaluation_plots import write_plots
+from perception.failure_sheet import write_failures
+from perception.ground_truth import GroundTruth, read_ground_truth
+from scenes.generate import Progress as Made
+from scenes.generate import generate
+from twin.evaluation_config import EvaluationConfig
+from twin.render_progress import image_progress
+from twin.robot import TwinError
+from twin.scorecard import check_writable
+
+REFINED = "pvnet-refined"
+"""Row of the published method with its refinement; its poses before that make the row ``pvnet``."""
+DATA_SET_NAME = "tagcell"
+"""In the names of BOP's files."""
+
+
+def run_evaluation(config: EvaluationConfig) -> dict[str, Any]:
+    """Render what is missing of the frames, run what is missing of the methods, write all files; returns the report.
+
+    Raises TwinError for a data set of another split and a folder that cannot be written, PerceptionError for missing
+    weights and a data set that cannot be read: before anything is rendered or run.
+    """
+    check_writable(config.out)
+    if config.data is not None:
+        check_data(config.data, config.split, config.domain)
+    estimators = load_estimators(config)
+    if config.data is None:
+        with image_progress("frames") as report:
+            generate(config.dataset(), config.frames, jobs=config.jobs, report=report)
+    truth = first_frames(read_ground_truth(config.frames, config.parts_dir), config)
+    made_with = weight_hashes(config.weights)
+    with method_progress(truth, list(estimators), config.out) as progress:
+        records = evaluate(
+            truth,
+            estimators,
+            config.out,
+            raw_names={REFINED: "pvnet"} if REFINED in estimators else None,
+            versions={name: " ".join(made_with.values()) for name in estimators},
+            parts_dir=config.parts_dir,
+            progress=progress,
+        )
+    return write_results(config, truth, records)
+
+
+def check_data(data: Path, split: str, domain: str | None = None) -> None:
+    """Raise PerceptionError when there is no finished data set, TwinError when it is not of this split and domain."""
+    manifest_hash(data)
+    dataset = read_json(data / DATASET)
+    found = dataset.get("split")
+    if found == "train":
+        raise TwinError(
+            f"{data} is of split 'train': networks may have learned these very images, so that figures on them say "
+            "nothing about new ones. Evaluate on a data set of split test"
+        )
+    if found != split:
+        remedy = "choices were made on it; if that is what you want, say --split val" if found == "val" else "choose it"
+        raise TwinError(f"{data} is of split {found!r}, not {split!r}: {remedy}")
+    if domain is not None and dataset.get("domain") != domain:
+        raise TwinError(f"--domain {domain} and --data {data}, which is of domain {dataset.get('domain')!r}")
+
+
+def load_estimators(config: EvaluationConfig) -> dict[str, PoseEstimator]:
+    """The estimators by the row that their poses make; raises PerceptionError when weights are missing."""
+    from perception.estimator import LearnedEstimator
+    from perception.pvnet_baseline import PvnetEstimator
+
+    estimators: dict[str, PoseEstimator] = {}
+    for method in config.methods:
+        if method == "tagcell":
+            estimators[method] = LearnedEstimator(config.weights, parts_dir=config.parts_dir)
+        else:
+            try:
+                estimators[REFINED] = PvnetEstimator(config.weights, parts_dir=config.parts_dir)
+            except PerceptionError as error:
+                raise PerceptionError(f"{error}; or leave the method out: --methods tagcell") from error
+    return estimators
+
+
+def weight_hashes(weights: Path | None) -> dict[str, str]:
+    """Hash of every weight file by its name, and of the choice's."""
+    from perception.estimator import WEIGHTS
+
+    folder = weights or WEIGHTS
+    return {p.name: hash_file(p) for p in sorted([*folder.glob("*.safetensors"), *folder.glob("choice.json")])}
+
+
+def first_frames(truth: GroundTruth, config: EvaluationConfig) -> GroundTruth:
+    """The frames that were asked for; raises TwinError when a given data set has fewer."""
+    if config.count is None or config.data is None:
+        return truth
+    if config.count > len(truth.frames):
+        raise TwinError(f"count {config.count}: {config.data} has {len(truth.frames)} frames")
+    return replace(truth, frames=truth.frames[: config.count])
+
+
+@contextmanager
+def method_progress(truth: GroundTruth, methods: list[str], out: Path) -> Iterator[Progress]:
+    """What ``evaluate`` is to tell how far it is: frames done, and the time left by the pace of this run."""
+    kept = sum(all(record_path(out, m, frame.image).exists() for m in methods) for frame in truth.frames)
+    started = time.monotonic()
+    with image_progress(", ".join(methods)) as report:
+
+        def progress(done: int, total: int, _: str) -> None:
+            made = max(0, done - kept)
+            report(Made(done=done, total=total, made=made, seconds=time.monotonic() - started))
+
+        yield progress
+
+
+def write_results(
+    config: EvaluationConfig, truth: GroundTruth, records: Mapping[str, list[FrameRecord]]
+) -> dict[str, Any]:
+    """Tables, plots, pictures of failures, BOP's and COCO's files; returns ``evaluation.json``."""
+    out = config.out
+    for method, own in records.items():
+        name = bop_results_name(method, DATA_SET_NAME, config.split)
+        write_bop_results(out / "bop" / name, [pose for record in own for pose in record.bop_poses()])
+        write_coco_results(out / "coco" / f"{method}.json", [d for record in own for d in record.detections])
+    write_plots([o for own in records.values() for o in outcomes_of(own)], out)
+    for k, (method, own) in enumerate(records.items()):
+        write_failures(out / ("failures.png" if k == 0 else f"failures_{method}.png"), truth, own)
+    return {}
