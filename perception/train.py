@@ -21,9 +21,11 @@ FLAT = (tyro.conf.OmitArgPrefixes,)
 
 TRAINERS: dict[str, str] = {
     "segmentation": "perception.train_segmentation:train_segmentation",
+    "maskrcnn": "perception.train_maskrcnn:train_maskrcnn",
     "classifier": "perception.train_crops:train_classifier",
     "verifier": "perception.train_crops:train_verifier",
     "keypoints": "perception.train_crops:train_keypoints",
+    "pvnet": "perception.pvnet_baseline_training:train_pvnet",
     "choice": "perception.fit_choice:fit_choice",
 }
 """Network name -> "module:function"; the function takes its config as ``config``, which tyro reads."""

@@ -96,13 +96,14 @@ class CropSource:
         count: int,
         rng: np.random.Generator,
         with_masks: bool = False,
-        among: NDArray[np.int64] | None = None,
+        rows: NDArray[np.int64] | None = None,
     ) -> tuple[NDArray[np.uint8], CropLabels, NDArray[np.bool_]]:
         """Images (B, 128, 128, 3), labels and, when asked for, masks on the voting grid (B, 64, 64).
 
-        Only the crops whose numbers are ``among`` are drawn when that is given.
+        ``rows`` (B,) are the crops to take; random ones when it is left out.
         """
-        rows = rng.integers(len(self.crops), size=count) if among is None else rng.choice(among, count)
+        if rows is None:
+            rows = rng.integers(len(self.crops), size=count)
         angles = rng.uniform(0.0, 2 * np.pi, count)
         warps = np.stack([crop_warp(a, rng.uniform(-SHIFT_PX, SHIFT_PX, 2)) for a in angles])
         images = np.stack([warp_image(self.crops.images[r], w) for r, w in zip(rows, warps, strict=True)])
