@@ -71,7 +71,7 @@ def read_bop_results(path: Path) -> list[BopPose]:
         before = times.setdefault((pose.scene_id, pose.im_id), pose.time_s)
         if pose.time_s != before:
             raise PerceptionError(
-                f"line {number} of {path}: time {pose.time_s:g} s, in a line before {before:g} s; it is that of the whole "
+                f"line {number} of {path}: time {pose.time_s:g} s, above it {before:g} s; it is that of the whole "
                 "image, the same in all its lines"
             )
         poses.append(pose)
