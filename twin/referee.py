@@ -6,7 +6,7 @@ board, for 1 s of simulated time; *placed* when at rest in a nest of its class w
 proper symmetries, and its roll where it is round), same face down as it was picked; it *succeeded* when picked and
 placed, no other part moved by more than 0.5 mm or 2 degrees in its attempts, and neither arm nor hand touched anything
 but the part, the board under it and the nest. A part may be pushed before it is picked: a *nudge* is judged like an
-attempt, may move and touch nothing but that part, and leaves it presented anew, as it then lies.
+attempt, may move and touch nothing but the first part that it touches, and leaves that presented anew, as it then lies.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Referee:
         self._open, self._nudging = True, nudge
         self._start = self.poses()
         self._gripped: list[int] = []
-        self._touched: set[int] = set()
+        self._touched: list[int] = []  # in the order of their first touch
         self._struck: dict[str, Array] = {}
         self._lowest = (np.inf, np.zeros(3))
         self._next_look_s = -np.inf
@@ -129,7 +129,7 @@ class Referee:
             self._lowest = (float(self._tcp_position[2]), self._tcp_position.copy())
         if not self._contacts.update():
             return
-        self._touched |= self._contacts.touched
+        self._touched += sorted(self._contacts.touched.difference(self._touched))
         for thing, point in self._contacts.strikes:
             self._strike(thing, point)
         for i in self._contacts.held:
@@ -191,7 +191,8 @@ class Referee:
             return
         self._open = False
         end = self.poses()
-        target = self._gripped[0] if self._gripped else self._nearest(self._lowest[1], self._start)
+        meant = self._gripped or (self._touched if self._nudging else [])
+        target = meant[0] if meant else self._nearest(self._lowest[1], self._start)
         moved = [
             i
             for i in range(len(self._parts))
@@ -208,7 +209,7 @@ class Referee:
         else:
             record.attempts += 1
         record.disturbed += [f"part_{i:02d}" for i in moved]
-        record.collisions += [f"part_{i:02d}" for i in sorted(self._touched - {target})]
+        record.collisions += [f"part_{i:02d}" for i in sorted(set(self._touched) - {target})]
         record.collisions += self._forbidden(target)
 
     def _has_moved(self, part: Part, T_before: Array, T_after: Array) -> bool:

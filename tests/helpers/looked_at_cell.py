@@ -15,7 +15,7 @@ from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.attempts import Calibration
 from twin.controller import PickController
-from twin.events import AttemptStarted, NudgeStarted
+from twin.events import AttemptStarted, Event, NudgeStarted
 from twin.nominal import nominal_calibration
 from twin.oracle import OracleEstimator
 from twin.referee import Referee
@@ -62,7 +62,9 @@ class LookedAtCell:
         self.robot = SimRobot(self.model, self.data, CELL, on_step=lambda: self.referee.watch())
         self.referee = Referee(self.model, self.data, CELL, self.parts)
         self.camera = _Camera(self.model, self.data, None, rng=np.random.default_rng(0), latency_s=0.3)
-        self.oracle, self.change, self.events = OracleEstimator(self.model, self.data, self.parts, CELL), change, []
+        self.oracle, self.change = OracleEstimator(self.model, self.data, self.parts, CELL), change
+        self.events: list[Event] = []
+        self.on_event: Callable[[Event], object] = lambda event: None
         self.controller = PickController(
             self.robot,
             self.camera,
@@ -86,7 +88,8 @@ class LookedAtCell:
         """Attempts of the controller and records of the referee."""
         return self.controller.run(), self.referee.finish()
 
-    def _on_event(self, event) -> None:
+    def _on_event(self, event: Event) -> None:
         self.events.append(event)
+        self.on_event(event)
         if isinstance(event, AttemptStarted | NudgeStarted):
             self.referee.begin_attempt(nudge=isinstance(event, NudgeStarted))
