@@ -13,28 +13,21 @@ from scipy.stats import beta, chi2
 from cad.spatial import Array
 from perception.bootstrap import clopper_pearson_upper
 from perception.outcomes import SYMMETRIC, Outcome
-from perception.plot_style import BAD, FAINT, colour_of, new_figure, say_empty, step_curve
+from perception.plot_style import FAINT, colour_of, new_figure, say_empty, step_curve
+from perception.references import BAD_SHARE, MSSD_MM, PAPER_REFINED
 
 Rows = Mapping[str, Sequence[Outcome]]
 """Outcomes by method."""
 
 ERRORS = {"e_x_mm": "e_x (mm)", "e_y_mm": "e_y (mm)", "e_z_mm": "e_z (mm)", "e_theta_deg": "e_theta (degrees)"}
-PAPER_MEAN = {
-    "inserted": {"e_x_mm": 0.57, "e_y_mm": 0.56, "e_z_mm": 1.02, "e_theta_deg": 2.52},
-    "main": {"e_x_mm": 0.62, "e_y_mm": 0.59, "e_z_mm": 0.97, "e_theta_deg": 2.60},
-    "top": {"e_x_mm": 0.99, "e_y_mm": 0.98, "e_z_mm": 1.29, "e_theta_deg": 2.55},
-}
-"""Means of the paper's Table 2, refined, of its own synthetic images."""
-RECALL_MM = (0.05, 0.1, 0.2, 0.5, 1.0)
-RISK_WANTED = 0.01
 _SPANS = {"e_x_mm": (1e-3, 30.0), "e_y_mm": (1e-3, 30.0), "e_z_mm": (1e-3, 300.0), "e_theta_deg": (1e-2, 180.0)}
 
 
 def risk_coverage(outcomes: Sequence[Outcome]) -> tuple[Array, Array, Array]:
-    """Coverage, wrong-branch share, and wrong share with false detections, each (K,), accepting ever lower scores.
+    """Coverage, share of bad among the accepted, and of wrong branches alone, each (K,), accepting ever lower scores.
 
-    Coverage is the share of all whole parts, so it ends at the share that is found. A point is kept for each score at
-    which something is accepted; before the first right or wrong part there is none.
+    Coverage is the share of all whole parts, so it ends at the share that is found. Bad are wrong branches and
+    detections of no part. A point is kept for each score at which something is accepted, from the first part on.
     """
     wanted = sum(o.whole and o.is_part for o in outcomes)
     seen = [o for o in outcomes if o.whole and (o.detected or not o.is_part)]
@@ -46,36 +39,35 @@ def risk_coverage(outcomes: Sequence[Outcome]) -> tuple[Array, Array, Array]:
     last_of_tie = np.append(np.diff(score[order]) < 0, True)[: len(order)]
     keep = (accepted > 0) & last_of_tie
     accepted, false, wrong = accepted[keep], false[keep], wrong[keep]
-    return accepted / max(wanted, 1), wrong / accepted, (wrong + false) / (accepted + false)
+    return accepted / max(wanted, 1), (wrong + false) / (accepted + false), wrong / accepted
 
 
 def plot_risk_coverage(rows: Rows) -> Figure:
-    """Wrong-branch share against accepted share; a dot where each method's gate is set."""
-    title = "What would be wrong among the accepted, if more or fewer were accepted"
+    """Share of bad among the accepted against the accepted share; a dot where each method's gate is set."""
+    title = "What would be bad among the accepted, if more or fewer were accepted"
     figure, ((axes,),) = new_figure(1, 1, (7.5, 4.8), title)
     for method, outcomes in rows.items():
-        coverage, wrong, with_false = risk_coverage(outcomes)
+        coverage, bad, wrong = risk_coverage(outcomes)
         if not coverage.size:
             continue
         colour = colour_of(method, list(rows))
-        axes.step(coverage, wrong, where="post", color=colour, label=f"{method}: wrong branch")
-        axes.step(coverage, with_false, where="post", color=colour, linestyle=":", label="... and false detections")
-        parts = [o for o in outcomes if o.whole and o.is_part]
-        accepted = [o for o in parts if o.accepted]
-        if accepted:
-            bad, n = sum(not o.branch_right_equivalent for o in accepted), len(accepted)
-            most = clopper_pearson_upper(bad, n)
-            said = f"gate: {n / len(parts):.1%} accepted, {bad / n:.2%} wrong (at most {most:.2%})"
-            axes.plot(n / len(parts), bad / n, "o", color=colour, mec="black", ms=8, zorder=5, label=said)
-    axes.axhline(RISK_WANTED, color=FAINT, linestyle="--", linewidth=1)
+        axes.step(coverage, bad, where="post", color=colour, label=f"{method}: wrong branch or no part")
+        axes.step(coverage, wrong, where="post", color=colour, linestyle=":", label="wrong branch only")
+        parts = sum(o.whole and o.is_part for o in outcomes)
+        accepted = [o for o in outcomes if o.whole and o.accepted]
+        if accepted and parts:
+            at = sum(o.is_part for o in accepted) / parts
+            n_bad = sum(not o.branch_right_equivalent for o in accepted)
+            share, most = n_bad / len(accepted), clopper_pearson_upper(n_bad, len(accepted))
+            said = f"gate: {at:.1%} accepted, {share:.2%} bad (at most {most:.2%})"
+            axes.plot(at, share, "o", color=colour, mec="black", ms=8, zorder=5, label=said)
+    axes.axhline(BAD_SHARE, color=FAINT, linestyle="--", linewidth=1)
     axes.set_yscale("symlog", linthresh=0.01, linscale=0.8)
     axes.yaxis.set_major_locator(FixedLocator([0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0]))
     axes.yaxis.set_minor_locator(FixedLocator([]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{100 * y:g} %"))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100 * x:.0f} %"))
-    axes.set(
-        xlim=(0.0, 1.005), ylim=(-5e-4, 1.0), xlabel="accepted, of all whole parts", ylabel="wrong, of the accepted"
-    )
+    axes.set(xlim=(0.0, 1.005), ylim=(-5e-4, 1.0), xlabel="accepted, of all whole parts", ylabel="bad, of the accepted")
     axes.grid(color="0.92")
     if axes.lines[:-1]:
         axes.legend(loc="upper left", fontsize=8)
@@ -99,8 +91,10 @@ def plot_cumulative_errors(rows: Rows) -> Figure:
                 found = [v for v in values if np.isfinite(v)]
                 if found:
                     axes.plot(np.mean(found), np.mean(np.array(values) <= np.mean(found)), "o", color=colour, ms=5)
-            if part in PAPER_MEAN:
-                axes.axvline(PAPER_MEAN[part][error], color="black", linestyle="--", linewidth=1, label="paper, mean")
+            if part in PAPER_REFINED:
+                axes.axvline(
+                    PAPER_REFINED[part][error], color="black", linestyle="--", linewidth=1, label="paper, mean"
+                )
             axes.grid(color="0.92")
             if row is grid[-1]:
                 axes.set_xlabel(label)
@@ -117,7 +111,7 @@ def plot_mssd_recall(rows: Rows) -> Figure:
     figure, (panels,) = new_figure(1, 1 + len(parts), (3.2, 3.0), title, sharey=True)
     for axes, part in zip(panels, [None, *parts], strict=True):
         axes.set(xscale="log", xlim=(0.005, 20.0), ylim=(0.0, 1.02), title=part or "all parts", xlabel="MSSD (mm)")
-        for mark in RECALL_MM:
+        for mark in MSSD_MM:
             axes.axvline(mark, color="0.9", linewidth=1, zorder=0)
         for method, outcomes in rows.items():
             own = [o for o in outcomes if o.whole and o.is_part and part in (None, o.part)]
@@ -164,7 +158,7 @@ def _quantiles(axes: Axes, values: Array, degrees: int, method: str, colour: str
     low, high = (chi2.ppf(beta.ppf(q, rank, n - rank + 1), degrees) for q in (0.025, 0.975))
     axes.fill_between(expected, low, high, color=FAINT, alpha=0.25, linewidth=0)
     label = f"{method}: {100 * within:.1f} % of {n} within the 95 % bound"
-    axes.plot(expected, np.sort(values), ".", ms=4, color=BAD if within < 0.8 else colour, label=label)
+    axes.plot(expected, np.sort(values), ".", ms=4, color=colour, label=label)
     return True
 
 

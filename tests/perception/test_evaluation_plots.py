@@ -30,14 +30,14 @@ def stray(score: float, **changes: object) -> Outcome:
 def test_risk_is_counted_down_the_scores_over_all_whole_parts():
     missed = replace(part(0.0), detected=False, class_right=False)
     rows = [part(0.9), part(0.8, right=False), part(0.7), missed, stray(0.75), part(0.95, right=False, whole=False)]
-    coverage, wrong, with_false = risk_coverage(rows)
+    coverage, bad, wrong = risk_coverage(rows)
     np.testing.assert_allclose(coverage, [0.25, 0.5, 0.5, 0.75])
     np.testing.assert_allclose(wrong, [0, 1 / 2, 1 / 2, 1 / 3])
-    np.testing.assert_allclose(with_false, [0, 1 / 2, 2 / 3, 2 / 4])
+    np.testing.assert_allclose(bad, [0, 1 / 2, 2 / 3, 2 / 4])
 
 
 def test_equal_scores_are_accepted_together():
-    coverage, wrong, _ = risk_coverage([part(0.5, right=False), part(0.5), part(0.5), part(0.2)])
+    coverage, _, wrong = risk_coverage([part(0.5, right=False), part(0.5), part(0.5), part(0.2)])
     np.testing.assert_allclose(coverage, [0.75, 1.0])
     np.testing.assert_allclose(wrong, [1 / 3, 1 / 4])
     assert all(a.size == 0 for a in risk_coverage([]))
@@ -84,13 +84,10 @@ def test_the_worst_failures_show_every_kind_and_the_accepted_first():
     assert [KINDS.index(k) for k, _ in kept] == sorted(KINDS.index(k) for k, _ in kept)
 
 
-@pytest.mark.parametrize("case", ["several methods", "one part", "nothing found"])
+@pytest.mark.parametrize("case", ["several methods", "nothing found"])
 def test_all_plots_are_written_as_pictures(tmp_path, case):
     rows = {
-        "several methods": made_outcomes("tagcell", 60, 1)
-        + made_outcomes("pvnet", 60, 1)
-       ,
-        "one part": [part(0.9, accepted=True, errors=None)],
+        "several methods": made_outcomes("tagcell", 60, 1) + made_outcomes("pvnet", 60, 1),
         "nothing found": [replace(part(0.0), detected=False, estimated_part="", class_right=False)],
     }[case]
     written = write_plots(rows, tmp_path / "plots")
