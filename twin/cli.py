@@ -19,6 +19,8 @@ from cad.parts import CadError
 from perception.estimates import PerceptionError
 from scenes.errors import SceneError
 from twin.estimate_cli import Estimate
+from twin.evaluate_cli import Evaluate
+from twin.export_cli import Export
 from twin.part_cli import Part
 from twin.pick_config import PickConfig
 from twin.render_cli import Data, Render
@@ -52,26 +54,39 @@ class Pick(PickConfig):
 class Train:
     """Render the training data where it is missing and train all networks; resumes where it was stopped."""
 
+    part: tuple[str, ...] = ()
+    """Parts to learn; the built-in ones by default. Others were added with `tagcell part add`."""
+    parts_dir: Path | None = None
+    """Folder with a user's own parts; TAGCELL_PARTS_DIR by default."""
     data: Path = Path("data")
     """Folder for the rendered data."""
     out: Path = Path("runs/train")
-    """Folder for weights, checkpoints and curves; use it with `tagcell pick --weights`."""
+    """Folder for weights, checkpoints, curves and pictures; use OUT/weights with `tagcell pick --weights`."""
     minutes: float = 60.0
-    """Training time of all networks together, shared out between them; rendering comes on top."""
+    """How long the networks learn; rendering and fitting the choice come on top. Less than 60 renders less data."""
     seed: int = 0
     """Seed of the data and of the training."""
     threads: int = os.cpu_count() or 1
-    """Threads that the networks train on."""
+    """Threads of the processor to use."""
     json: bool = False
     """Print the paths of the weights as JSON."""
 
     def run(self) -> None:
         """Train everything."""
-        from twin.training import train_all
+        from twin.training import TrainPlan, train_all
 
-        written = train_all(data=self.data, out=self.out, minutes=self.minutes, seed=self.seed, threads=self.threads)
-        if self.json:
-            print(json.dumps([str(p) for p in written]))
+        written = train_all(
+            TrainPlan(
+                data=self.data,
+                out=self.out,
+                minutes=self.minutes,
+                seed=self.seed,
+                threads=self.threads,
+                parts=self.part,
+                parts_dir=self.parts_dir,
+            )
+        )
+        print(json.dumps([str(p) for p in written]) if self.json else "\n".join(map(str, written)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,7 +133,9 @@ Verb = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Data, subcommand("data")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Estimate, subcommand("estimate")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Part, subcommand("part")]
     | Annotated[View, subcommand("view")]
     | Annotated[Doctor, subcommand("doctor")]
