@@ -27,6 +27,8 @@ from perception.outcomes import Outcome, outcome_from_json, outcome_to_json
 from perception.pose_comparison import as_raw
 
 FOLDER = "estimates"
+WHOLE_FRAMES = "scene"
+"""``kind`` in ``dataset.json`` of whole frames, in which the tags are seen."""
 TOTAL = "total"
 """Key in ``FrameRecord.seconds`` of the wall time from frame to poses."""
 
@@ -87,8 +89,14 @@ def evaluate(
     """Records by method, a list in the order of the frames; frames that are done are read instead.
 
     ``raw_names`` maps a method to the name under which its poses before refinement are judged as a method of their own.
-    ``versions`` say what a method is, such as the hashes of its weights.
+    ``versions`` say what a method is, such as the hashes of its weights. Raises PerceptionError when the data set does
+    not hold whole frames.
     """
+    if truth.dataset["kind"] != WHOLE_FRAMES:
+        raise PerceptionError(
+            f"the data set holds images of kind {truth.dataset['kind']!r}; poses are evaluated on whole frames, kind "
+            f"{WHOLE_FRAMES!r}, which show the tags: render such a one"
+        )
     table = FaceTable(truth.parts)
     raw_names = dict(raw_names or {})
     judges = {name: Judge(method=name, domain=truth.domain, table=table) for name in [*estimators, *raw_names.values()]}

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+from perception.breakdowns import MISSED, NOTHING
 from perception.evaluation_tables import BASELINE, OURS
-from perception.outcomes import COMPARISONS, ERRORS, SYMMETRIC
+from perception.markdown import interval, markdown_table, number, share
+from perception.outcomes import ERRORS
+from perception.pose_report import ERROR_NAMES, decisions, surface_recall, table_2
 from perception.pose_tables import ALL
-from perception.references import PAPER_RAW, PAPER_REFINED
+from perception.references import PAPER_REFINED
 
 Tables = Mapping[str, Any]
-UNKNOWN = "-"
-_NAMES = {"e_x_mm": "e_x mm", "e_y_mm": "e_y mm", "e_z_mm": "e_z mm", "e_theta_deg": "e_theta deg"}
-_KNOWN_AS = {
-    "strict": "as they stand (strict)",
-    "symmetric": "modulo the part's proper symmetries",
-    "equivalent": "modulo what looks the same from above",
-}
 
 
 def evaluation_markdown(tables: Tables) -> str:
@@ -27,9 +23,9 @@ def evaluation_markdown(tables: Tables) -> str:
         _goals(tables),
         _headline(tables),
         _table_1(tables),
-        _table_2(tables),
-        _decisions(tables),
-        _surface_recall(tables),
+        table_2(tables),
+        decisions(tables),
+        surface_recall(tables),
         _covariance(tables),
         _confusion(tables),
         _groups(tables),
@@ -38,43 +34,19 @@ def evaluation_markdown(tables: Tables) -> str:
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; the first column to the left, the others to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number with so many digits that count, a dash when it is not known."""
-    if value is None:
-        return UNKNOWN
-    if isinstance(value, int) or abs(value) >= 10 ** (digits - 1):
-        return f"{value:.0f}"
-    return f"{value:#.{digits}g}".rstrip(".") if value else "0"
-
-
-def share(value: float | None) -> str:
-    """A share in per cent."""
-    return UNKNOWN if value is None else f"{100 * value:.1f} %"
-
-
-def _interval(bounds: Sequence[float | None] | None) -> str:
-    return UNKNOWN if bounds is None else f"{number(bounds[0])} to {number(bounds[1])}"
-
-
 def _head(tables: Tables) -> str:
     return (
         f"# Evaluation: {tables['domain']}\n\n"
         f"{tables['n_images']} whole frames of split `{tables['splits']['evaluated']}`, {tables['n_parts']} parts of "
         f"which at least 60 % is visible and that the border does not cut; {tables['n_parts_not_whole']} others are "
-        "left out, as are detections on them. The camera's pose comes from the tags in the frame. Intervals are 95 % bootstraps over "
-        "frames; bounds of shares are one-sided 95 % Clopper-Pearson."
+        "left out, as are detections on them. The camera's pose comes from the tags in the frame. Intervals are 95 % "
+        "bootstraps over frames; bounds of shares are one-sided 95 % Clopper-Pearson."
     )
 
 
 def _goals(tables: Tables) -> str:
     rows = [
-        [g["name"], g["wanted"], number(g["measured"], 4), _interval(g["interval_95"]), "yes" if g["met"] else "**no**"]
+        [g["name"], g["wanted"], number(g["measured"], 4), interval(g["interval_95"]), "yes" if g["met"] else "**no**"]
         for g in tables.get("goals", [])
     ]
     if not rows:
@@ -92,13 +64,13 @@ def _headline(tables: Tables) -> str:
         ratio = figures["ratio"]
         text = f"times smaller than `{BASELINE}`, same {figures['n_common']} parts"
         rows.append([f"{text}, means", *(number(ratio[e]["mean"]) for e in ERRORS)])
-        rows.append(["interval", *(_interval(ratio[e]["mean_interval_95"]) for e in ERRORS)])
+        rows.append(["interval", *(interval(ratio[e]["mean_interval_95"]) for e in ERRORS)])
         rows.append([f"{text}, medians", *(number(ratio[e]["median"]) for e in ERRORS)])
     rows.append(["the paper's mean, refined, of its own images", *(number(PAPER_REFINED[ALL][e]) for e in ERRORS)])
     rows.append(["times smaller than the paper's", *(number(figures["ratio_to_paper"][e]) for e in ERRORS)])
     return (
         f"## Headline: `{OURS}`, all {figures['n']} parts that it found\n\n"
-        + markdown_table(("", *_NAMES.values()), rows)
+        + markdown_table(("", *ERROR_NAMES.values()), rows)
         + "\n\nNothing is left out because it was declined, and wrong classes, faces and yaws count with their errors."
     )
 
@@ -121,84 +93,6 @@ def _table_1(tables: Tables) -> str:
     )
 
 
-def _table_2(tables: Tables) -> str:
-    parts = list(next(iter(tables["pose"].values()), {}))
-    text = ["## Table 2: poses"]
-    for comparison in COMPARISONS:
-        for selection, said in (("all", "all that were found"), ("accepted", "accepted only")):
-            beside_paper = selection == "all" and comparison == SYMMETRIC
-            rows = [
-                row
-                for part in parts
-                for method, pose in tables["pose"].items()
-                for stage in ("raw", "refined")
-                if (row := _pose_row(part, f"`{method}` {stage}", pose[part][stage][selection][comparison]))
-            ]
-            if beside_paper:
-                rows += [
-                    [part, f"the paper {stage} (means)", UNKNOWN, *(number(of[part][e]) for e in ERRORS)]
-                    for part in parts
-                    for stage, of in (("raw", PAPER_RAW), ("refined", PAPER_REFINED))
-                    if part in of
-                ]
-                rows.sort(key=lambda row: parts.index(row[0]))
-            note = "" if selection == "all" else " The paper declines nothing: these do not compare with its figures."
-            text.append(
-                f"**{said.capitalize()}, {_KNOWN_AS[comparison]}**: mean ± std, median, p95.{note}\n\n"
-                + markdown_table(("part", "method", "n", *_NAMES.values()), rows)
-            )
-    return "\n\n".join(text)
-
-
-def _pose_row(part: str, name: str, errors: Tables) -> list[str]:
-    """Empty where nothing was measured."""
-    n = errors[ERRORS[0]]["n"]
-    return [part, name, str(n), *(_spread(errors[e]) for e in ERRORS)] if n else []
-
-
-def _spread(s: Tables) -> str:
-    return f"{number(s['mean'])} ± {number(s['std'])}, {number(s['median'])}, {number(s['p95'])}"
-
-
-def _decisions(tables: Tables) -> str:
-    rows = []
-    for method, pose in tables["pose"].items():
-        for part, p in pose.items():
-            shares = ("class_right", "face_right", "branch_right", "branch_right_equivalent", "flip_rate")
-            rows.append(
-                [
-                    f"`{method}` {part}",
-                    str(p["n_parts"]),
-                    *(share(p[s]) for s in ("missed_share", *shares, "accepted_share")),
-                    f"{p['n_bad']} of {p['n_accepted']}",
-                    *(share(p[s]) for s in ("bad_share", "bad_share_upper_95")),
-                ]
-            )
-    header = ("", "parts", "missed", "class right", "face right", "branch right", "view-equivalent", "flipped")
-    header += ("accepted", "wrong among accepted", "share", "at most (95 %)")
-    return (
-        "## Class, face and yaw\n\n"
-        + markdown_table(header, rows)
-        + "\n\nRight and flipped: of the parts found. Branch: class, stable pose, and yaw within 6 degrees; flipped: "
-        "the face is right, the yaw more than 90 degrees off. Accepted: of all parts. Wrong among accepted: another "
-        "branch than the view allows, or no part at all."
-    )
-
-
-def _surface_recall(tables: Tables) -> str:
-    first = next(iter(tables["pose"].values()), None)
-    if first is None:
-        return ""
-    limits = list(first[ALL]["mssd_recall"])
-    rows = [
-        [f"`{method}` {part}", *(share(p["mssd_recall"][limit]) for limit in limits)]
-        for method, pose in tables["pose"].items()
-        for part, p in pose.items()
-    ]
-    table = markdown_table(("", *(f"{limit} mm" for limit in limits)), rows)
-    return f"## Recall of MSSD\n\n{table}\n\nOf all parts, missed ones included."
-
-
 def _covariance(tables: Tables) -> str:
     rows = []
     for method, parts in tables["calibration_of_covariance"].items():
@@ -210,7 +104,7 @@ def _covariance(tables: Tables) -> str:
                         "x, y, yaw" if kind == "nees_planar" else "all six",
                         str(c["n"]),
                         number(c["mean"]),
-                        _interval(c["mean_bounds_95"]),
+                        interval(c["mean_bounds_95"]),
                         *(number(c[name]) for name in ("median", "median_expected")),
                         share(c["within_95"]),
                     ]
@@ -228,8 +122,11 @@ def _covariance(tables: Tables) -> str:
 def _confusion(tables: Tables) -> str:
     text = ["## Confusion"]
     for method, c in tables["confusion"].items():
-        columns = sorted({name for row in c["class"].values() for name in row})
-        rows = [[true, *(str(row.get(name, 0)) for name in columns)] for true, row in c["class"].items()]
+        columns = sorted({name for row in c["class"].values() for name in row}, key=lambda name: (name == MISSED, name))
+        rows = [
+            [true, *(str(row.get(name, 0)) for name in columns)]
+            for true, row in sorted(c["class"].items(), key=lambda item: item[0] == NOTHING)
+        ]
         text.append(f"**`{method}`**, true class by row:\n\n{markdown_table(('class', *columns), rows)}")
         wrong = [
             [part, true, taken, str(n)]

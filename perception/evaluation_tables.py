@@ -34,12 +34,14 @@ def evaluation_tables(
     *,
     splits: Mapping[str, Any] | None = None,
     instances: Mapping[str, Sequence[CocoResult]] | None = None,
+    min_scores: Mapping[str, float] | None = None,
     main: str = OURS,
     draws: int = 1000,
 ) -> dict[str, Any]:
     """The content of ``evaluation.json``, JSON-ready: what is not known is None.
 
-    ``instances`` are results of methods that find instances and no poses. ``segmentation`` and ``latency_s`` are those
+    ``instances`` are results of methods that find instances and no poses, which count from ``min_scores`` on (those
+    below are for curves over all scores). ``segmentation`` and ``latency_s`` are those
     of the method ``main``; those of all methods stand in ``segmentation_by_method`` and ``latency_s_by_method``.
     """
     names = [part.name for part in truth.parts]
@@ -47,7 +49,7 @@ def evaluation_tables(
     rows = {method: outcomes_of(own) for method, own in records.items()}
     found = {m: [d for record in own for d in record.detections] for m, own in records.items() if m != BASELINE_RAW}
     segmentation = {
-        method: instance_scores(truth, results, bootstrap)
+        method: instance_scores(truth, results, bootstrap, (min_scores or {}).get(method, 0.0))
         for method, results in (found | dict(instances or {})).items()
     }
     latency = {method: latency_figures(own) for method, own in records.items()}

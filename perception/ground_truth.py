@@ -19,9 +19,7 @@ from perception.bop_files import DATASET, Entry, manifest_hash, read_entries, re
 from perception.estimates import Frame, PerceptionError
 from perception.outcomes import WHOLE_SHARE
 
-COCO_FILE, CAMERA_FILE = "scene_gt_coco.json", "camera.json"
-WHOLE_FRAMES = "scene"
-"""``kind`` in ``dataset.json`` of whole frames, in which the tags are seen."""
+COCO_FILE = "scene_gt_coco.json"
 IMAGES_A_SCENE = 1000
 """BOP's number of images a folder: an image's number in a data set is 1000 times its folder's plus its own."""
 _SURROUNDINGS_PX = 256
@@ -82,8 +80,8 @@ class FrameTruth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundTruth:
-    """A finished data set of whole frames: how it was made (``dataset.json``), the hash of its manifest, the parts that
-    may be in it and its frames in order.
+    """A finished data set of frames or windows: how it was made (``dataset.json``), the hash of its manifest, the parts
+    that may be in it and its frames in order.
     """
 
     dataset: Mapping[str, Any]
@@ -103,17 +101,12 @@ class GroundTruth:
 
 
 def read_ground_truth(data_dir: Path, parts_dir: Path | None = None) -> GroundTruth:
-    """The frames of a finished data set.
+    """The images of a finished data set.
 
-    Raises PerceptionError when it is not finished, does not hold whole frames, or was rendered with other meshes than
-    the parts have now.
+    Raises PerceptionError when it is not finished, or was rendered with other meshes than the parts have now.
     """
     entries = read_entries(data_dir)
     dataset = read_json(data_dir / DATASET)
-    if dataset["kind"] != WHOLE_FRAMES:
-        raise PerceptionError(
-            f"{data_dir} holds images of kind {dataset['kind']!r}; evaluation needs whole frames, {WHOLE_FRAMES!r}"
-        )
     parts = tuple(load_part(name, parts_dir) for name in dataset["parts"])
     for part in parts:
         rendered = dataset["parts"][part.name]["mesh"]
@@ -123,8 +116,7 @@ def read_ground_truth(data_dir: Path, parts_dir: Path | None = None) -> GroundTr
                 "render the data set again"
             )
     by_id = {part.obj_id: part for part in parts}
-    camera = read_json(data_dir / CAMERA_FILE)
-    size = (int(camera["width"]), int(camera["height"]))
+    size = (int(dataset["size"][0]), int(dataset["size"][1]))
     runs = {shard: _visible_runs(shard) for shard in {entry.shard for entry in entries}}
     frames = tuple(_frame(entry, by_id, size, runs[entry.shard]) for entry in entries)
     return GroundTruth(

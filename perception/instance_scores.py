@@ -49,13 +49,17 @@ class _Hits:
     iou: list[float] = field(default_factory=list)
 
 
-def instance_scores(truth: GroundTruth, results: Sequence[CocoResult], bootstrap: FrameBootstrap) -> dict[str, Any]:
+def instance_scores(
+    truth: GroundTruth, results: Sequence[CocoResult], bootstrap: FrameBootstrap, min_score: float = 0.0
+) -> dict[str, Any]:
     """``miou``, COCO's ``ap``, ``ap50``, ``ap75``, ``ar`` (pycocotools), ``precision50``, ``recall50`` and how sure
-    they are, the mean overlap of the instances found, the paper's AP and AR by threshold, and figures by part.
+    they are, the mean overlap of the instances found, the paper's AP and AR by threshold, and figures by part. Results
+    below ``min_score`` count for COCO's figures alone, which are made of all scores.
     """
     of_image: dict[int, list[CocoResult]] = defaultdict(list)
     for result in results:
-        of_image[result["image_id"]].append(result)
+        if result["score"] >= min_score:
+            of_image[result["image_id"]].append(result)
     hits = _Hits()
     pixels = {part.obj_id: _Pixels() for part in truth.parts}
     by_class = {part.obj_id: DetectionScores() for part in truth.parts}
