@@ -21,8 +21,8 @@ from scenes.arm import FORCE_NUMERIC, GRIPPER_ACTUATOR, SPEED_NUMERIC
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_arm
 from twin.attempts import ControllerConfig
-from twin.ik import top_down
 from twin.profiles import JointPath, LinearPath, speed_for
+from twin.robot import top_down
 from twin.sim_robot import SimRobot, SimRobotConfig
 
 

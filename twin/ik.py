@@ -14,7 +14,7 @@ import numpy as np
 
 from cad.gripper import T_FLANGE_TCP
 from cad.robot import JOINT_NAMES, forward_kinematics, inverse_kinematics
-from cad.spatial import Array, inverse, rotation_angle, rotvec_from_rotation, transform
+from cad.spatial import Array, inverse, rotation_angle, rotvec_from_rotation
 from twin.robot import TwinError
 
 TCP_SITE, FLANGE_SITE = "tcp", "flange"
@@ -148,12 +148,6 @@ class ArmIk:
     def _residual(self, T_base_tcp: Array) -> tuple[float, float]:
         T = self._configuration.get_transform_frame_to_world(TCP_SITE, "site").as_matrix()
         return float(np.linalg.norm(T[:3, 3] - T_base_tcp[:3, 3])), rotation_angle(T[:3, :3], T_base_tcp[:3, :3])
-
-
-def top_down(x: float, y: float, z: float, yaw: float) -> Array:
-    """``T_base_tcp`` (4, 4) of a tool that points straight down at (x, y, z) m, closing direction at ``yaw`` rad."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], [x, y, z])
 
 
 def _describe(T_base_tcp: Array) -> str:

@@ -11,8 +11,7 @@ from cad import gripper
 from cad.spatial import Array, apply, inverse
 from twin.attempts import Calibration
 from twin.candidates import Candidate
-from twin.ik import top_down
-from twin.robot import TwinError
+from twin.robot import TwinError, top_down
 
 FINGERS_M = float(np.hypot(gripper.PAD_WIDTH_M / 2, gripper.PAD_THICKNESS_M))
 """Closed fingers stay within this distance of the tool's axis, as high as parts reach."""

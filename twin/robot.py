@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-from cad.spatial import Array
+import numpy as np
+
+from cad.spatial import Array, transform
 from perception.estimates import Frame
 
 
@@ -65,6 +67,12 @@ class LinearMove:
     speed: float
     acceleration: float
     duration_s: float
+
+
+def top_down(x: float, y: float, z: float, yaw: float) -> Array:
+    """``T_base_tcp`` (4, 4) of a tool that points straight down at (x, y, z) m, closing direction at ``yaw`` rad."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], [x, y, z])
 
 
 class Robot(Protocol):

@@ -8,8 +8,7 @@ from twin.grasp_choice import PlacedPart, choose_grasp
 from twin.grasp_config import GraspConfig
 from twin.grasp_geometry import convex_gap, footprint
 from twin.grasps import read_grasps
-from twin.ik import top_down
-from twin.robot import TwinError
+from twin.robot import TwinError, top_down
 
 NEST = planar(0.40, 0.25, 0.0)
 

@@ -6,7 +6,8 @@ from cad.robot import JOINT_RANGE_RAD, UR5E, forward_kinematics
 from cad.robot_calibration import table_from_axes
 from cad.spatial import apply, rotation_angle, rotation_from_rotvec, transform
 from scenes.workcell import CellConfig, build_arm
-from twin.ik import ArmIk, IkError, top_down
+from twin.ik import ArmIk, IkError
+from twin.robot import top_down
 
 CELL = CellConfig()
 

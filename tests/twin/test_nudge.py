@@ -13,10 +13,11 @@ from perception.estimates import AMBIGUOUS, NOT_A_PART, PartEstimate
 from twin.candidates import Candidate
 from twin.events import LookedAgain, NudgeFinished, NudgeStarted
 from twin.grasp_choice import PlacedPart
-from twin.ik import IkError, top_down
+from twin.ik import IkError
 from twin.nominal import nominal_calibration
 from twin.nudge import FINGERS_M, NudgeConfig, plan_nudge
 from twin.park_pose import park_elsewhere, room_beside_board
+from twin.robot import top_down
 from twin.second_look import SecondLookConfig
 
 PART = load_part("main")

@@ -10,9 +10,8 @@ from cad.spatial import rotation_angle
 from scenes.gl import mujoco
 from scenes.workcell import CellConfig, build_workcell
 from twin.attempts import ControllerConfig
-from twin.ik import top_down
 from twin.profiles import JointPath, LinearPath, ProfileError
-from twin.robot import GripState, MotionRefused, RobotError
+from twin.robot import GripState, MotionRefused, RobotError, top_down
 from twin.sim_robot import SimRobot, SimRobotConfig
 
 CELL = CellConfig()
