@@ -29,7 +29,7 @@ from perception.score_crops import score_classifier, score_keypoints, score_veri
 from perception.training import Step, TrainingConfig, TrainingResult, seeded, train
 from perception.training_pictures import classifier_sheet, keypoints_sheet, save_picture
 from perception.verifier import PairSampler, Verifier, listwise, verifier_loss
-from perception.weight_files import save_weights, weights_metadata
+from perception.weight_files import load_weights, save_weights, weights_metadata
 
 SHIFT_PX = 3.0
 
@@ -38,7 +38,8 @@ SHIFT_PX = 3.0
 class CropTrainingConfig(TrainingConfig):
     """Folders with the crops, besides how to train. ``validate`` crops of ``val`` are scored now and then.
 
-    ``parts`` are those that the crops show, the built-in ones by default.
+    ``parts`` are those that the crops show, the built-in ones by default. ``start`` names a folder with earlier weights
+    of the same network and faces to go on from.
     """
 
     data: tuple[Path, ...]
@@ -46,6 +47,7 @@ class CropTrainingConfig(TrainingConfig):
     out: Path = Path("perception/weights")
     parts: tuple[str, ...] = ()
     parts_dir: Path | None = None
+    start: Path | None = None
     validate: int = 400
 
     @cached_property
@@ -207,6 +209,13 @@ def train_on_crops(
     some_val, some_labels = take_crops(val, some), val_labels.take(some)
     with seeded(config.seed):
         model = build(table).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    minutes_before = 0.0
+    if config.start is not None:
+        path = config.start / f"{name}.safetensors"
+        state, earlier = load_weights(path, config.parts_dir)
+        table.check(earlier["faces"], path.name)
+        model.load_state_dict(state)
+        minutes_before = earlier["minutes"] + earlier.get("minutes_before_start", 0.0)
     step = make_step(model, CropSource(crops, labels, config.seed), config)
 
     def validate(now: nn.Module) -> dict[str, float]:
@@ -219,6 +228,7 @@ def train_on_crops(
     figures = score(model.eval(), val, val_labels, table)
     data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}
     names = [part.name for part in table.parts]
-    metadata = weights_metadata(names, config, result, data, figures, config.parts_dir) | {"faces": table.describe()}
+    metadata = weights_metadata(names, config, result, data, figures, config.parts_dir)
+    metadata |= {"faces": table.describe(), "minutes_before_start": minutes_before}
     save_weights(config.out / f"{name}.safetensors", result.state_dict, metadata)
     return result
