@@ -57,7 +57,7 @@ class ImageMaker:
     def __init__(self, config: DatasetConfig, folder: Path | None = None) -> None:
         self._config = config
         parts = config.load_parts()
-        streams = [np.random.default_rng([STREAMS[config.split], kind]) for kind in range(3)]
+        streams = backgrounds(config.split)
         self._stage = Stage(
             parts,
             make_textures(streams[0], TEXTURES),
@@ -73,8 +73,7 @@ class ImageMaker:
     def make(self, index: int) -> LabelledImage:
         """Image number ``index``."""
         config, stage = self._config, self._stage
-        seeds = np.random.SeedSequence([STREAMS[config.split], config.seed, index]).spawn(3)
-        shot_rng, look_rng, sensor_rng = (np.random.default_rng(seed) for seed in seeds)
+        shot_rng, look_rng, sensor_rng = image_streams(config.split, config.seed, index)
         shot = self._shot(shot_rng)
         instances = stage.arrange(shot)
         stage.lens = lens = draw_lens(config.lens, sensor_rng)
@@ -110,6 +109,17 @@ class ImageMaker:
         if config.kind == "window":
             return self._sampler.window(rng, config.pixels, int(config.scale_down))
         return self._sampler.frame(rng, config.frame, config.scale_down)
+
+
+def backgrounds(split: Split) -> list[np.random.Generator]:
+    """The streams of a split's textures, environments and wear."""
+    return [np.random.default_rng([STREAMS[split], kind]) for kind in range(3)]
+
+
+def image_streams(split: Split, seed: int, index: int) -> list[np.random.Generator]:
+    """The streams of an image's shot, look and sensor."""
+    seeds = np.random.SeedSequence([STREAMS[split], seed, index]).spawn(3)
+    return [np.random.default_rng(child) for child in seeds]
 
 
 def stage_config(config: DatasetConfig) -> StageConfig:

@@ -82,7 +82,7 @@ class ShotRanges(LayoutRanges):
                 raise SceneError(f"{name} {getattr(self, name)}: must be from 0 to 1")
         if self.empty_beside_px is not None and self.target_share > 0:
             raise SceneError(
-                f"empty_beside_px {self.empty_beside_px} and target_share {self.target_share}: the first part of a crop "
+                f"empty_beside_px {self.empty_beside_px} and target_share {self.target_share}: a crop's first part "
                 "is its target, so only sets without targets show parts beside an empty middle; set target_share to 0"
             )
         if self.empty_beside_px is not None and not 0 < self.empty_beside_px[0] <= self.empty_beside_px[1]:
