@@ -44,6 +44,8 @@ class Evaluate:
     """Folder of your own parts; TAGCELL_PARTS_DIR or your data directory when left out."""
     methods: tuple[Method, ...] = ("tagcell", "pvnet")
     """What is compared: Tagcell's own estimator; PVNet's stages, which make two rows, raw and refined."""
+    detections: Annotated[tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="")] = ()
+    """Detections that other programs, such as Mask R-CNN, made of the same frames, for the table of instances."""
     jobs: int = os.cpu_count() or 1
     """Processes that render, 2.5 GB each."""
     out: Path = Path("runs/evaluate")

@@ -6,31 +6,36 @@ there. Tables, plots and pictures follow from what is kept.
 
 from __future__ import annotations
 
+import json
+import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from cad.files import replacing, write_json
 from cad.parts import hash_file
 from perception.bop_files import DATASET, manifest_hash, read_json
 from perception.bop_results import bop_results_name, write_bop_results
 from perception.coco_results import write_coco_results
 from perception.estimates import PerceptionError, PoseEstimator
-from perception.evaluate import FrameRecord, Progress, evaluate, outcomes_of, record_path
+from perception.evaluate import FOLDER, FrameRecord, Progress, evaluate, outcomes_of, record_path
 from perception.evaluation_plots import write_plots
+from perception.evaluation_report import evaluation_markdown
+from perception.evaluation_tables import BASELINE, BASELINE_RAW, OURS, evaluation_tables
 from perception.failure_sheet import write_failures
 from perception.ground_truth import GroundTruth, read_ground_truth
+from perception.stored_detections import StoredDetections, read_detections
 from scenes.generate import Progress as Made
 from scenes.generate import generate
+from twin.doctor import versions
 from twin.evaluation_config import EvaluationConfig
 from twin.render_progress import image_progress
 from twin.robot import TwinError
 from twin.scorecard import check_writable
 
-REFINED = "pvnet-refined"
-"""Row of the published method with its refinement; its poses before that make the row ``pvnet``."""
 DATA_SET_NAME = "tagcell"
 """In the names of BOP's files."""
 
@@ -49,18 +54,21 @@ def run_evaluation(config: EvaluationConfig) -> dict[str, Any]:
         with image_progress("frames") as report:
             generate(config.dataset(), config.frames, jobs=config.jobs, report=report)
     truth = first_frames(read_ground_truth(config.frames, config.parts_dir), config)
-    made_with = weight_hashes(config.weights)
+    refuse_learned(config.weights, truth.manifest, config.frames)
+    stored = [(path, read_detections(path)) for path in config.detections]
+    for path, detections in stored:
+        detections.check(truth.manifest, [frame.image for frame in truth.frames], path)
     with method_progress(truth, list(estimators), config.out) as progress:
         records = evaluate(
             truth,
             estimators,
             config.out,
-            raw_names={REFINED: "pvnet"} if REFINED in estimators else None,
-            versions={name: " ".join(made_with.values()) for name in estimators},
+            raw_names={BASELINE: BASELINE_RAW} if BASELINE in estimators else None,
+            versions={method: " ".join(hashes.values()) for method, hashes in weight_hashes(config).items()},
             parts_dir=config.parts_dir,
             progress=progress,
         )
-    return write_results(config, truth, records)
+    return write_results(config, truth, records, [detections for _, detections in stored])
 
 
 def check_data(data: Path, split: str, domain: str | None = None) -> None:
@@ -88,21 +96,49 @@ def load_estimators(config: EvaluationConfig) -> dict[str, PoseEstimator]:
     estimators: dict[str, PoseEstimator] = {}
     for method in config.methods:
         if method == "tagcell":
-            estimators[method] = LearnedEstimator(config.weights, parts_dir=config.parts_dir)
+            estimators[OURS] = LearnedEstimator(config.weights, parts_dir=config.parts_dir)
         else:
             try:
-                estimators[REFINED] = PvnetEstimator(config.weights, parts_dir=config.parts_dir)
+                estimators[BASELINE] = PvnetEstimator(config.weights, parts_dir=config.parts_dir)
             except PerceptionError as error:
                 raise PerceptionError(f"{error}; or leave the method out: --methods tagcell") from error
     return estimators
 
 
-def weight_hashes(weights: Path | None) -> dict[str, str]:
-    """Hash of every weight file by its name, and of the choice's."""
+def weight_hashes(config: EvaluationConfig) -> dict[str, dict[str, str]]:
+    """Hashes of the files that each estimator's result depends on, by its row and the file's name."""
+    folder = config.weights or _weights_of_package()
+    hashes = {
+        path.name: hash_file(path) for path in sorted([*folder.glob("*.safetensors"), *folder.glob("choice.json")])
+    }
+    theirs = ("segmentation.safetensors", "pvnet.safetensors")
+    by_row = {
+        OURS: {name: value for name, value in hashes.items() if name != theirs[1]},
+        BASELINE: {name: hashes[name] for name in theirs if name in hashes},
+    }
+    return {row: by_row[row] for row in (OURS if method == "tagcell" else BASELINE for method in config.methods)}
+
+
+def learned_from(weights: Path | None) -> dict[str, Any]:
+    """What the weight files say about the data that they were made from, by the file's name."""
+    folder = weights or _weights_of_package()
+    notes = {path.stem: read_json(path) for path in sorted(folder.glob("*.json"))}
+    return {name: note.get("data", note.get("fitted_on")) for name, note in notes.items()}
+
+
+def refuse_learned(weights: Path | None, manifest: str, data: Path) -> None:
+    """Raise TwinError when the weights were made from this data set, whatever split it says it is of."""
+    for name, made_from in learned_from(weights).items():
+        if manifest in json.dumps(made_from):
+            raise TwinError(
+                f"the weights {name} were made from {data} itself: evaluate on a data set that they never saw"
+            )
+
+
+def _weights_of_package() -> Path:
     from perception.estimator import WEIGHTS
 
-    folder = weights or WEIGHTS
-    return {p.name: hash_file(p) for p in sorted([*folder.glob("*.safetensors"), *folder.glob("choice.json")])}
+    return WEIGHTS
 
 
 def first_frames(truth: GroundTruth, config: EvaluationConfig) -> GroundTruth:
@@ -118,6 +154,12 @@ def first_frames(truth: GroundTruth, config: EvaluationConfig) -> GroundTruth:
 def method_progress(truth: GroundTruth, methods: list[str], out: Path) -> Iterator[Progress]:
     """What ``evaluate`` is to tell how far it is: frames done, and the time left by the pace of this run."""
     kept = sum(all(record_path(out, m, frame.image).exists() for m in methods) for frame in truth.frames)
+    if kept:
+        print(
+            f"{kept} of {len(truth.frames)} frames have estimates already; delete {out / FOLDER} to make them again"
+            " although data and weights are the same",
+            file=sys.stderr,
+        )
     started = time.monotonic()
     with image_progress(", ".join(methods)) as report:
 
@@ -129,15 +171,42 @@ def method_progress(truth: GroundTruth, methods: list[str], out: Path) -> Iterat
 
 
 def write_results(
-    config: EvaluationConfig, truth: GroundTruth, records: Mapping[str, list[FrameRecord]]
+    config: EvaluationConfig,
+    truth: GroundTruth,
+    records: Mapping[str, list[FrameRecord]],
+    stored: Sequence[StoredDetections] = (),
 ) -> dict[str, Any]:
-    """Tables, plots, pictures of failures, BOP's and COCO's files; returns ``evaluation.json``."""
+    """Tables, plots, pictures of failures, BOP's and COCO's files; returns the content of ``evaluation.json``."""
     out = config.out
     for method, own in records.items():
         name = bop_results_name(method, DATA_SET_NAME, config.split)
         write_bop_results(out / "bop" / name, [pose for record in own for pose in record.bop_poses()])
         write_coco_results(out / "coco" / f"{method}.json", [d for record in own for d in record.detections])
+    tables = evaluation_tables(
+        truth,
+        records,
+        splits={"weights_made_from": learned_from(config.weights)},
+        instances={d.method: d.results for d in stored},
+        min_scores={d.method: d.min_score for d in stored},
+        main=next(iter(records)),
+    )
+    tables |= {
+        "config": config_json(config),
+        "versions": versions(),
+        "weights": weight_hashes(config),
+    }
     write_plots([o for own in records.values() for o in outcomes_of(own)], out)
     for k, (method, own) in enumerate(records.items()):
         write_failures(out / ("failures.png" if k == 0 else f"failures_{method}.png"), truth, own)
-    return {}
+    write_json(out / "evaluation.json", tables)
+    with replacing(out / "evaluation.md") as temporary:
+        temporary.write_text(evaluation_markdown(tables), encoding="utf-8")
+    return tables
+
+
+def config_json(config: EvaluationConfig) -> dict[str, Any]:
+    """The configuration without what cannot change the result."""
+    values = asdict(config)
+    for name in ("out", "jobs", "parts_dir"):
+        del values[name]
+    return json.loads(json.dumps(values, default=str))

@@ -38,6 +38,7 @@ class EvaluationConfig:
     part: tuple[str, ...] = ()
     parts_dir: Path | None = None
     methods: tuple[Method, ...] = ("tagcell", "pvnet")
+    detections: tuple[Path, ...] = ()
     jobs: int = os.cpu_count() or 1
 
     def __post_init__(self) -> None:
