@@ -10,13 +10,18 @@ OUT    ?= runs/pick
 SCENES ?= 5
 SEED   ?= 0
 ESTIMATOR ?= learned
+MASKRCNN := .venv-maskrcnn
+MASKRCNN_NEEDS := torchvision scipy trimesh networkx opencv-python-headless pycocotools safetensors tyro matplotlib
+DATA   ?=
+DETECTIONS ?= runs/maskrcnn/$(notdir $(DATA:/=)).json
 
-.PHONY: help setup pick test test-slow check format cad clean
+.PHONY: help setup pick test test-slow check format cad maskrcnn clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^#   //p' Makefile
 	@echo "also: make setup, test-slow (the long tests), format, cad (rebuild parts and samples; installs build123d), clean"
+	@echo "      make maskrcnn DATA=DIR (what Mask R-CNN finds in a data set, for tagcell evaluate; an environment of its own, 6 GB)"
 	@echo "variables: OUT=$(OUT) SCENES=$(SCENES) SEED=$(SEED) ESTIMATOR=$(ESTIMATOR) PYTHON=$(PYTHON)"
 
 $(READY): pyproject.toml constraints.txt
@@ -52,5 +57,13 @@ cad: setup
 	$(BIN)/python -m cad.models.build
 	$(BIN)/python -m cad.models.samples
 
+$(MASKRCNN)/.ready: constraints-maskrcnn.txt
+	@test -x $(MASKRCNN)/bin/python || $(PYTHON) -m venv $(MASKRCNN)
+	$(MASKRCNN)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-maskrcnn.txt $(MASKRCNN_NEEDS)
+	@touch $@
+
+maskrcnn: $(MASKRCNN)/.ready
+	$(if $(DATA),$(MASKRCNN)/bin/python -m perception.run_maskrcnn --data $(DATA) --out $(DETECTIONS))
+
 clean:
-	rm -rf $(VENV) build *.egg-info runs .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) $(MASKRCNN) build *.egg-info runs .pytest_cache .ruff_cache .import_linter_cache

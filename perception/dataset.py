@@ -236,7 +236,11 @@ def _instance_map(entry: Entry, shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _read_windows(data_dir: Path) -> WindowSet:
-    entries = read_entries(data_dir)
+    return windows_of(read_entries(data_dir))
+
+
+def windows_of(entries: Sequence[Entry]) -> WindowSet:
+    """Windows or frames, read from their files; all must be of one size."""
     images = _read_images(entries)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         maps = np.stack(list(pool.map(lambda e: _instance_map(e, images.shape[1:3]), entries)))

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -171,7 +172,15 @@ class Examined:
     seconds: float
 
 
-def examine(segmenter: Segmenter, windows: Iterable[Window]) -> list[Examined]:
+class FindsParts(Protocol):
+    """What can be examined on windows."""
+
+    def detect_reduced(self, image: NDArray[np.uint8]) -> list[Detection]:
+        """The parts in an RGB image (H, W, 3) of a window."""
+        ...
+
+
+def examine(segmenter: FindsParts, windows: Iterable[Window]) -> list[Examined]:
     """Run the segmenter on windows and compare."""
     out = []
     for window in windows:

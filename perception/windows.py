@@ -47,11 +47,11 @@ def filled(instances: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class Windows:
-    """The training windows as examples."""
+    """The training windows as examples, their instances without holes unless ``holes`` are asked for."""
 
-    def __init__(self, data: WindowSet, parts: Sequence[Part]) -> None:
+    def __init__(self, data: WindowSet, parts: Sequence[Part], *, holes: bool = False) -> None:
         self.data = data
-        self.instances = np.stack([filled(instances) for instances in data.instance_map])
+        self.instances = data.instance_map if holes else np.stack([filled(each) for each in data.instance_map])
         self.labels = data.labels(parts)
 
     def __len__(self) -> int:
