@@ -35,7 +35,7 @@ def made_outcomes(
             out.append(Outcome(**about))
             continue
         bad = rng.uniform() < wrong
-        kind = rng.integers(3) if bad else -1
+        kind = int(rng.integers(3)) if bad else -1
         e = np.abs(rng.normal(0, [0.02, 0.02, 0.01, 0.1])) * scale + (np.array([0.3, 0.3, 0.5, 90]) if bad else 0)
         if kind == 2:
             e[3] = 180.0
