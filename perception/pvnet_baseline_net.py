@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from cad.spatial import Array
 from perception.augment import network_input
+from perception.estimates import PerceptionError
 from perception.layers import Residual, conv_block
 from perception.posenets import CropKeypoints
 from perception.pvnet import CHANNELS, at_cells, grid_pixels
@@ -94,9 +95,16 @@ class Pvnets(nn.Module):
         return decoder
 
     def start_from(self, votes: StateDict) -> None:
-        """Take over encoder and decoders, but not their heads, from the weights of our own votes."""
+        """Take over encoder and decoders, but not their heads, from the weights of our own votes.
+
+        Raises PerceptionError when they are another network's.
+        """
         for module in (self.encoder, *(self.decoder(part) for part in self.decoders)):
             wanted = {key for key in module.state_dict() if not key.startswith("head.")}
+            if missing := sorted(wanted - set(votes)):
+                raise PerceptionError(
+                    f"the weights to start from have no {', '.join(missing[:3])}; give keypoints.safetensors, or none"
+                )
             module.load_state_dict({key: votes[key] for key in wanted}, strict=False)
 
 
