@@ -12,15 +12,18 @@ SEED   ?= 0
 ESTIMATOR ?= learned
 MASKRCNN := .venv-maskrcnn
 MASKRCNN_NEEDS := torchvision scipy trimesh networkx opencv-python-headless pycocotools safetensors tyro matplotlib
+SCRATCH ?= runs/scratch
+MINUTES ?= 28
 DATA   ?=
 DETECTIONS ?= runs/maskrcnn/$(notdir $(DATA:/=)).json
 
-.PHONY: help setup pick test test-slow check format cad maskrcnn clean
+.PHONY: help setup pick test test-slow check format cad from-scratch maskrcnn clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^#   //p' Makefile
 	@echo "also: make setup, test-slow (the long tests), format, cad (rebuild parts and samples; installs build123d), clean"
+	@echo "      make from-scratch (render, train $(MINUTES) minutes and evaluate into $(SCRATCH): an hour on two cores)"
 	@echo "      make maskrcnn DATA=DIR (what Mask R-CNN finds in a data set, for tagcell evaluate; an environment of its own, 6 GB)"
 	@echo "variables: OUT=$(OUT) SCENES=$(SCENES) SEED=$(SEED) ESTIMATOR=$(ESTIMATOR) PYTHON=$(PYTHON)"
 
@@ -56,6 +59,12 @@ cad: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[cad]'
 	$(BIN)/python -m cad.models.build
 	$(BIN)/python -m cad.models.samples
+
+from-scratch: setup
+	@began=$$(date +%s) && \
+	$(BIN)/tagcell train --minutes $(MINUTES) --data $(SCRATCH)/data --out $(SCRATCH) && \
+	$(BIN)/tagcell evaluate --domain classic --count 20 --methods tagcell --weights $(SCRATCH)/weights --out $(SCRATCH)/evaluation && \
+	echo "from CAD to evaluated networks in $$(( ($$(date +%s) - began) / 60 )) minutes"
 
 $(MASKRCNN)/.ready: constraints-maskrcnn.txt
 	@test -x $(MASKRCNN)/bin/python || $(PYTHON) -m venv $(MASKRCNN)
