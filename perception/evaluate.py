@@ -7,7 +7,7 @@ that was stopped goes on where it was. A file that was made from other data or b
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -107,7 +107,7 @@ def evaluate(
             if progress:
                 progress(k, len(truth.frames), name)
             rows = [name, *([raw_names[name]] if name in raw_names else [])]
-            made_from = f"{truth.manifest} {(versions or {}).get(name, '')}".strip()
+            made_from = _made_from(truth, name, versions)
             done = [_read_if_made_from(record_path(out, row, frame_truth.image), made_from) for row in rows]
             if any(record is None for record in done):
                 frame = frame or frame_truth.frame()
@@ -125,6 +125,17 @@ def evaluate(
     if progress:
         progress(len(truth.frames), len(truth.frames), "done")
     return records
+
+
+def kept_frames(
+    truth: GroundTruth, methods: Iterable[str], out: Path, versions: Mapping[str, str] | None = None
+) -> int:
+    """Of how many frames ``evaluate`` would read the records of all ``methods`` instead of running them."""
+    expected = [(method, _made_from(truth, method, versions)) for method in methods]
+    return sum(
+        all(_read_if_made_from(record_path(out, method, frame.image), made) for method, made in expected)
+        for frame in truth.frames
+    )
 
 
 def record_path(out: Path, method: str, image: int) -> Path:
@@ -181,6 +192,10 @@ def _record(
         seconds={stage: float(s) for stage, s in estimate.seconds.items()},
         note=note,
     )
+
+
+def _made_from(truth: GroundTruth, method: str, versions: Mapping[str, str] | None) -> str:
+    return f"{truth.manifest} {(versions or {}).get(method, '')}".strip()
 
 
 def _read_if_made_from(path: Path, made_from: str) -> FrameRecord | None:

@@ -63,5 +63,6 @@ class Evaluate:
         if self.json:
             print(json.dumps(report, indent=1))
         else:
-            print((self.out / "evaluation.md").read_text().rstrip())
-            print(f"\n{self.out / 'evaluation.md'}")
+            text = (self.out / "evaluation.md").read_text(encoding="utf-8")
+            print(text.split("\n## Table 1")[0].rstrip())
+            print(f"\nall tables: {self.out / 'evaluation.md'}")

@@ -21,7 +21,7 @@ from perception.bop_files import DATASET, manifest_hash, read_json
 from perception.bop_results import bop_results_name, write_bop_results
 from perception.coco_results import write_coco_results
 from perception.estimates import PerceptionError, PoseEstimator
-from perception.evaluate import FOLDER, FrameRecord, Progress, evaluate, outcomes_of, record_path
+from perception.evaluate import FOLDER, FrameRecord, Progress, evaluate, kept_frames, outcomes_of
 from perception.evaluation_plots import write_plots
 from perception.evaluation_report import evaluation_markdown
 from perception.evaluation_tables import BASELINE, BASELINE_RAW, OURS, evaluation_tables
@@ -43,12 +43,14 @@ DATA_SET_NAME = "tagcell"
 def run_evaluation(config: EvaluationConfig) -> dict[str, Any]:
     """Render what is missing of the frames, run what is missing of the methods, write all files; returns the report.
 
-    Raises TwinError for a data set of another split and a folder that cannot be written, PerceptionError for missing
-    weights and a data set that cannot be read: before anything is rendered or run.
+    Raises TwinError for a data set of another split and a folder that cannot be written, CadError for parts that there
+    are not, PerceptionError for missing weights and a data set that cannot be read: before anything is rendered or run.
     """
     check_writable(config.out)
     if config.data is not None:
         check_data(config.data, config.split, config.domain)
+    else:
+        config.dataset().load_parts()
     estimators = load_estimators(config)
     if config.data is None:
         with image_progress("frames") as report:
@@ -58,13 +60,21 @@ def run_evaluation(config: EvaluationConfig) -> dict[str, Any]:
     stored = [(path, read_detections(path)) for path in config.detections]
     for path, detections in stored:
         detections.check(truth.manifest, [frame.image for frame in truth.frames], path)
-    with method_progress(truth, list(estimators), config.out) as progress:
+    made_with = {row: " ".join(hashes.values()) for row, hashes in weight_hashes(config).items()}
+    kept = kept_frames(truth, estimators, config.out, made_with)
+    if kept:
+        print(
+            f"{kept} of {len(truth.frames)} frames were estimated before from the same data and weights and are kept; "
+            f"delete {config.out / FOLDER} to make them again",
+            file=sys.stderr,
+        )
+    with method_progress(", ".join(estimators), kept) as progress:
         records = evaluate(
             truth,
             estimators,
             config.out,
             raw_names={BASELINE: BASELINE_RAW} if BASELINE in estimators else None,
-            versions={method: " ".join(hashes.values()) for method, hashes in weight_hashes(config).items()},
+            versions=made_with,
             parts_dir=config.parts_dir,
             progress=progress,
         )
@@ -151,21 +161,13 @@ def first_frames(truth: GroundTruth, config: EvaluationConfig) -> GroundTruth:
 
 
 @contextmanager
-def method_progress(truth: GroundTruth, methods: list[str], out: Path) -> Iterator[Progress]:
-    """What ``evaluate`` is to tell how far it is: frames done, and the time left by the pace of this run."""
-    kept = sum(all(record_path(out, m, frame.image).exists() for m in methods) for frame in truth.frames)
-    if kept:
-        print(
-            f"{kept} of {len(truth.frames)} frames have estimates already; delete {out / FOLDER} to make them again"
-            " although data and weights are the same",
-            file=sys.stderr,
-        )
+def method_progress(what: str, kept: int) -> Iterator[Progress]:
+    """What ``evaluate`` is to tell how far it is: frames done, and the time left by the pace of those not ``kept``."""
     started = time.monotonic()
-    with image_progress(", ".join(methods)) as report:
+    with image_progress(what) as report:
 
         def progress(done: int, total: int, _: str) -> None:
-            made = max(0, done - kept)
-            report(Made(done=done, total=total, made=made, seconds=time.monotonic() - started))
+            report(Made(done=done, total=total, made=max(0, done - kept), seconds=time.monotonic() - started))
 
         yield progress
 
