@@ -38,6 +38,9 @@ from twin.scorecard import check_writable
 
 DATA_SET_NAME = "tagcell"
 """In the names of BOP's files."""
+BASELINE_WEIGHTS = ("segmentation.safetensors", "pvnet.safetensors")
+OTHER_WEIGHTS = ("pvnet.safetensors", "maskrcnn.safetensors")
+"""In the same folder, but not Tagcell's own."""
 
 
 def run_evaluation(config: EvaluationConfig) -> dict[str, Any]:
@@ -121,10 +124,9 @@ def weight_hashes(config: EvaluationConfig) -> dict[str, dict[str, str]]:
     hashes = {
         path.name: hash_file(path) for path in sorted([*folder.glob("*.safetensors"), *folder.glob("choice.json")])
     }
-    theirs = ("segmentation.safetensors", "pvnet.safetensors")
     by_row = {
-        OURS: {name: value for name, value in hashes.items() if name != theirs[1]},
-        BASELINE: {name: hashes[name] for name in theirs if name in hashes},
+        OURS: {name: value for name, value in hashes.items() if name not in OTHER_WEIGHTS},
+        BASELINE: {name: value for name, value in hashes.items() if name in BASELINE_WEIGHTS},
     }
     return {row: by_row[row] for row in (OURS if method == "tagcell" else BASELINE for method in config.methods)}
 
