@@ -32,8 +32,6 @@ class ContourConfig:
     scanned neighbourhoods the best ``candidates`` are fitted. ``stride`` thins the samples until the last step.
     A start is taken to be right within ``start_sigma_m``: a candidate at that distance must explain ``stray_cost`` more
     of the brightness than one at the start. ``places`` that are ``apart_m`` and explain ``nearly`` as much are told.
-    The stated covariance is ``covariance_scale`` times that of independent noise, plus the squares of ``floor_m`` and
-    ``floor_yaw``, as errors on validation crops ask for: parts lean a little, and shading is not even.
     """
 
     grid_px: float = 8.0
@@ -53,9 +51,6 @@ class ContourConfig:
     places: int = 2
     apart_m: float = 1.5e-4
     nearly: float = 0.08
-    covariance_scale: float = 4.0
-    floor_m: float = 1.6e-5
-    floor_yaw: float = float(np.radians(0.05))
     profile: ProfileConfig = field(default_factory=ProfileConfig)
 
     def __post_init__(self) -> None:
@@ -71,7 +66,8 @@ class ContourConfig:
 class Refinement:
     """A contour laid on the image.
 
-    ``x``, ``y`` m and ``yaw`` rad in the table frame with ``covariance`` (3, 3); ``matched_fraction`` of the weighted
+    ``x``, ``y`` m and ``yaw`` rad in the table frame with ``covariance`` (3, 3), as of independent noise (see
+    ``perception.covariance`` for what errors really are); ``matched_fraction`` of the weighted
     contour has an edge within a pixel, ``matched_outline`` the same for outlines alone; ``correlation`` in [0, 1] is
     the mean contrast-normalised gradient across the contour; ``explained`` in [0, 1] the share of the brightness
     variance along profiles across it that the CAD's patches explain.
@@ -135,8 +131,7 @@ def _result(edges: EdgeImage, model: ProfileModel, fit: ProfileFit, config: Cont
         x=float(fit.pose[0]),
         y=float(fit.pose[1]),
         yaw=float(fit.pose[2]),
-        covariance=fit.covariance * config.covariance_scale
-        + np.diag([config.floor_m**2, config.floor_m**2, config.floor_yaw**2]),
+        covariance=fit.covariance,
         matched_fraction=matched,
         matched_outline=matched_outline,
         correlation=correlation,

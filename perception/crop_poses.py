@@ -1,4 +1,9 @@
-"""Poses of the parts in crops: the networks' hypotheses are refined by their contours and the best one is chosen."""
+"""Poses of the parts in crops: the networks' hypotheses are refined by their contours and the best one is chosen.
+
+How many are refined depends on how sure the networks are. Where they agree by a large margin and the contour bears
+them out it is one; else the readings next in line, the best one turned round, the best of the runner-up class and of
+the segmenter's class are tried as well. Of what both networks call no part none is.
+"""
 
 from __future__ import annotations
 
@@ -11,50 +16,73 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import planar
-from cad.spatial import Array, Intrinsics, apply, wrap_angle
-from perception.choice import FEATURES, ChoiceWeights, gate_evidence
+from cad.spatial import Array, Intrinsics, apply
+from perception.alternatives import Placement, pose_alternatives, same_reading
+from perception.choice import FEATURES, ChoiceWeights, CropContext, gate_evidence
 from perception.contour import ContourConfig, Refinement, refine_all
+from perception.crop_view import HALF, CropView, half_size
+from perception.estimates import PoseAlternative
 from perception.faces import Face
-from perception.gradients import EdgeImage, Image32, brightness
+from perception.gradients import EdgeImage, brightness
 from perception.labels import ray_of_crop
-from perception.planar import PlanarError, on_plane, solve_planar
-from perception.posenets import CropKeypoints, CropReading, Hypothesis, PoseNets
+from perception.posenets import CropKeypoints, Hypothesis, PoseNets
 from perception.region import region_scores
+from perception.shortlist import Shortlist, ShortlistConfig, shortlist, turned_by_keypoints
+from perception.sighting import Sighting
 from perception.silhouette import render_view
 
-CROP_PX = 256
-HALF = 2
-"""The networks see crops at half the camera's resolution."""
+SAME_PLACE_M = 1.5e-4
+"""Candidates of one reading that lie nearer are no rivals."""
+LEAST_LOG = -10.0
+LEAST_CLASS = 0.01
+"""What the networks' log-probabilities, and the segmenter's probability of a class, count as at least."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CropPoseConfig:
-    """Which hypotheses are refined: at most ``refined``, those within ``nats`` of the best network score.
+    """How hypotheses are chosen for refinement, refined and weighed.
 
     ``prior_weight`` scales how much the stable poses' probabilities count; 0 takes all faces as equally likely.
-    Keypoints further than ``keypoint_limit_px`` camera pixels from where a hypothesis puts them all count alike.
+    Keypoints further than ``keypoint_limit_px`` camera pixels from where a hypothesis puts them all count alike. A
+    single hypothesis stands when its contour matches by ``sure_matched``, explains ``sure_explained`` (as fractions)
+    and its silhouette overlaps the segmenter's mask by ``sure_overlap``.
     """
 
-    refined: int = 3
-    nats: float = 6.0
+    shortlist: ShortlistConfig = field(default_factory=ShortlistConfig)
     prior_weight: float = 0.0
     keypoint_limit_px: float = 15.0
-    same_yaw: float = float(np.radians(12.0))
+    sure_matched: float = 0.6
+    sure_explained: float = 0.6
+    sure_overlap: float = 0.5
     contour: ContourConfig = field(default_factory=ContourConfig)
 
     def __post_init__(self) -> None:
-        if self.refined < 1 or self.nats <= 0 or self.prior_weight < 0:
-            raise ValueError(f"refined {self.refined}, nats {self.nats}, prior_weight {self.prior_weight}: too small")
+        if self.prior_weight < 0 or self.keypoint_limit_px <= 0:
+            raise ValueError(
+                f"prior_weight {self.prior_weight} must be at least 0, keypoint_limit_px {self.keypoint_limit_px} above"
+            )
+        for name in ("sure_matched", "sure_explained", "sure_overlap"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """A refined hypothesis: face, refinement, evidence (len(FEATURES),) and the keypoints voted for its face."""
+    """A refined hypothesis: face, refinement, evidence (len(FEATURES),), the keypoints voted for its face, and whether
+    it came of the likeliest hypothesis. Its refinement is just the start when it was not worth refining.
+    """
 
     face: Face
     refinement: Refinement
     evidence: Array
     keypoints: CropKeypoints | None
+    first: bool
+
+    @property
+    def placement(self) -> Placement:
+        """Face index, x, y and yaw in the table frame."""
+        r = self.refinement
+        return self.face.index, r.x, r.y, r.yaw
 
     def T_cam_part(self, T_cam_table: Array) -> Array:
         """(4, 4) pose in the camera."""
@@ -64,16 +92,19 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropPose:
-    """The candidates of a crop with their scores (H,), the winner's index, the probability that the winner is right,
-    its lead in nats, and the probability that the crop shows no part.
+    """The candidates of a crop with their scores (H,) and the winner's index; the probability that the winner is right,
+    that there is a part at all, and the evidence for both; what else is known of the crop; whether the networks were
+    sure of the first hypothesis and its contour bore them out.
     """
 
     candidates: tuple[Candidate, ...]
     scores: Array
     best: int
     probability: float
+    part_probability: float
     gate_evidence: Array
-    not_a_part: float
+    context: CropContext
+    sure: bool
 
     @property
     def winner(self) -> Candidate:
@@ -91,144 +122,179 @@ class CropSolver:
         self,
         crops: NDArray[np.uint8],
         intrinsics: Sequence[Intrinsics],
-        T_cam_table: Sequence[Array],
+        T_cam_table: Array,
+        sightings: Sequence[Sighting],
+        tag_rms_px: float,
         seconds: dict[str, float] | None = None,
     ) -> list[CropPose]:
-        """Poses in crops (N, 256, 256, 3) RGB at full resolution with their intrinsics and table frames.
+        """Poses in crops (N, 256, 256, 3) RGB at full resolution with their intrinsics, of one frame.
 
-        ``seconds`` is filled with the time each stage took.
+        ``sightings`` are the segmenter's. ``seconds`` is filled with the time each stage took.
         """
         spent = seconds if seconds is not None else {}
         started = time.perf_counter()
-        halves = np.stack([_half(crop) for crop in crops]) if len(crops) else np.zeros((0, 128, 128, 3), np.uint8)
+        halves = np.stack([half_size(crop) for crop in crops]) if len(crops) else np.zeros((0, 128, 128, 3), np.uint8)
         small = [k.downscaled(HALF) for k in intrinsics]
         rays = np.array([ray_of_crop(k) for k in small]).reshape(-1, 2)
         readings = self.nets.verify(halves, rays, self.nets.hypotheses(halves, rays))
-        kept = [self._shortlist(reading) for reading in readings]
-        spent["networks"] = time.perf_counter() - started
+        config = self.config.shortlist
+        short = [shortlist(r, s, self.nets.table, config) for r, s in zip(readings, sightings, strict=True)]
+        views = [
+            CropView(
+                crop=crop,
+                half=half,
+                ray=ray,
+                intrinsics=k,
+                T_cam_table=T_cam_table,
+                reading=reading,
+                sighting=sighting,
+                tag_rms_px=tag_rms_px,
+            )
+            for crop, half, ray, k, reading, sighting in zip(
+                crops, halves, rays, intrinsics, readings, sightings, strict=True
+            )
+        ]
+        spent.update({"networks": time.perf_counter() - started, "keypoints": 0.0, "refinement": 0.0})
+        poses = self._solved(views, short, spent)
+        # Whatever the networks were sure of, but its contour does not bear out, is tested under the other readings.
+        doubtful = [i for i, pose in enumerate(poses) if short[i].sure and not pose.sure]
+        wider = [replace(short[i], sure=False, wanted=short[i].others) for i in doubtful]
+        for i, pose in zip(doubtful, self._solved([views[i] for i in doubtful], wider, spent), strict=True):
+            poses[i] = pose
+        return poses
 
+    def alternatives(self, pose: CropPose, T_cam_table: Array) -> tuple[PoseAlternative, ...]:
+        """The poses that the crop leaves open, the winner's first."""
+        return pose_alternatives(
+            self.nets.table,
+            [candidate.placement for candidate in pose.candidates],
+            pose.scores,
+            T_cam_table,
+            temperature=self.weights.temperature,
+            mass=self.weights.set_mass,
+            prior_weight=self.config.prior_weight,
+        )
+
+    def _solved(self, views: Sequence[CropView], short: Sequence[Shortlist], spent: dict[str, float]) -> list[CropPose]:
         started = time.perf_counter()
-        faces = [(i, face) for i, found in enumerate(kept) for face in sorted({(h.part, h.stable_pose) for h in found})]
-        rows = [i for i, _ in faces]
-        voted = self.nets.keypoints(halves[rows], rays[rows], [face for _, face in faces])
-        votes = dict(zip(faces, voted, strict=True))
-        spent["keypoints"] = time.perf_counter() - started
+        faces = [
+            (i, face)
+            for i, found in enumerate(short)
+            for face in sorted({(h.part, h.stable_pose) for h in found.wanted})
+        ]
+        halves = np.stack([views[i].half for i, _ in faces]) if faces else np.zeros((0, 128, 128, 3), np.uint8)
+        rays = np.array([views[i].ray for i, _ in faces]).reshape(-1, 2)
+        voted = dict(zip(faces, self.nets.keypoints(halves, rays, [face for _, face in faces]), strict=True))
+        spent["keypoints"] += time.perf_counter() - started
 
         started = time.perf_counter()
         out = []
-        for i, (crop, reading) in enumerate(zip(crops, readings, strict=True)):
-            mine = {face: votes[i, face] for row, face in faces if row == i}
-            candidates = self._refined(brightness(crop), intrinsics[i], T_cam_table[i], kept[i], mine)
-            out.append(self._choose(candidates, reading))
-        spent["refinement"] = time.perf_counter() - started
+        for i, (view, found) in enumerate(zip(views, short, strict=True)):
+            votes = {face: keypoints for (row, face), keypoints in voted.items() if row == i}
+            candidates = self._refined(view, found.wanted, votes) if found.wanted else [self._unrefined(view)]
+            out.append(self._choose(candidates, view, found.sure))
+        spent["refinement"] += time.perf_counter() - started
         return out
 
-    def _shortlist(self, reading: CropReading) -> list[Hypothesis]:
-        best = reading.hypotheses[0].log_probability
-        likely = [h for h in reading.hypotheses if best - h.log_probability < self.config.nats]
-        return likely[: self.config.refined]
-
     def _refined(
-        self,
-        gray: Image32,
-        intrinsics: Intrinsics,
-        T_cam_table: Array,
-        hypotheses: Sequence[Hypothesis],
-        votes: dict[tuple[str, int], CropKeypoints],
+        self, view: CropView, hypotheses: Sequence[Hypothesis], votes: dict[tuple[str, int], CropKeypoints]
     ) -> list[Candidate]:
-        edges, small = EdgeImage.of(gray), intrinsics.downscaled(HALF)
+        gray = brightness(view.crop)
+        edges, small = EdgeImage.of(gray), view.small
+        turned = turned_by_keypoints(
+            hypotheses, votes, self.nets.table, small, view.T_cam_table, self.config.shortlist.same_yaw
+        )
         found: list[Candidate] = []
-        for h in self._with_keypoint_yaws(hypotheses, votes, small, T_cam_table):
+        for k, h in enumerate([*hypotheses, *turned]):
             face = self.nets.table[self.nets.table.index_of(h.part, h.stable_pose)]
-            x, y = (float(c) for c in on_plane(h.centre_px, face.middle_m, small, T_cam_table)[:2])
+            x, y = view.place(h, face)
             places = refine_all(
-                edges, intrinsics, face.part, h.stable_pose, T_cam_table, x, y, h.yaw, self.config.contour
+                edges, view.intrinsics, face.part, h.stable_pose, view.T_cam_table, x, y, h.yaw, self.config.contour
             )
             keypoints = votes.get((h.part, h.stable_pose))
             for r in places:
-                candidate = Candidate(face=face, refinement=r, evidence=np.zeros(len(FEATURES)), keypoints=keypoints)
-                if any(_same_pose(candidate, other) for other in found):
-                    continue
-                evidence = {
-                    "classifier": h.classifier,
-                    "verifier": h.verifier,
-                    "matched_fraction": r.matched_fraction,
-                    "matched_outline": r.matched_outline,
-                    "correlation": r.correlation,
-                    "explained": r.explained,
-                    "keypoints": self._keypoint_agreement(candidate, small, T_cam_table),
-                }
-                found.append(replace(candidate, evidence=np.array([evidence.get(name, 0.0) for name in FEATURES])))
-        views = [render_view(c.face.part, c.T_cam_part(T_cam_table), small).facet for c in found]
+                candidate = Candidate(
+                    face=face, refinement=r, evidence=np.zeros(len(FEATURES)), keypoints=keypoints, first=k == 0
+                )
+                if not any(_same_pose(candidate, other) for other in found):
+                    found.append(replace(candidate, evidence=self._evidence(view, h, candidate)))
+        facets = [render_view(c.face.part, c.T_cam_part(view.T_cam_table), small).facet for c in found]
         half_gray = cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        for candidate, region in zip(found, region_scores(half_gray, views), strict=True):
+        for candidate, facet, region in zip(found, facets, region_scores(half_gray, facets), strict=True):
             candidate.evidence[FEATURES.index("region_fit")] = region.fit
             candidate.evidence[FEATURES.index("region_unexplained")] = region.unexplained
+            candidate.evidence[FEATURES.index("overlap")] = view.sighting.overlap(facet >= 0)
         return found
 
-    def _with_keypoint_yaws(
-        self,
-        hypotheses: Sequence[Hypothesis],
-        votes: dict[tuple[str, int], CropKeypoints],
-        small: Intrinsics,
-        T_cam_table: Array,
-    ) -> list[Hypothesis]:
-        """The hypotheses, and for the best one's face what its keypoints say when that is another yaw."""
-        best = hypotheses[0]
-        keypoints = votes.get((best.part, best.stable_pose))
-        if keypoints is None:
-            return list(hypotheses)
-        face = self.nets.table[self.nets.table.index_of(best.part, best.stable_pose)]
-        try:
-            solved = solve_planar(
-                face.part.keypoints, keypoints.pixels, keypoints.covariances, face.stable_pose, small, T_cam_table
-            )
-        except PlanarError:
-            return list(hypotheses)
-        known = [h.yaw for h in hypotheses if (h.part, h.stable_pose) == (best.part, best.stable_pose)]
-        if min(abs(float(wrap_angle(solved.yaw - yaw))) for yaw in known) < self.config.same_yaw:
-            return list(hypotheses)
-        middle = apply(T_cam_table, [solved.x, solved.y, face.middle_m])
-        centre = small.project(middle)
-        worst = min(h.classifier for h in hypotheses) - 1.0, min(h.verifier for h in hypotheses) - 1.0
-        extra = replace(
-            best,
-            yaw=solved.yaw,
-            centre_px=(float(centre[0]), float(centre[1])),
-            classifier=worst[0],
-            verifier=worst[1],
-        )
-        return [*hypotheses, extra]
+    def _evidence(self, view: CropView, h: Hypothesis, candidate: Candidate) -> Array:
+        r = candidate.refinement
+        known = {
+            "classifier": max(h.classifier, LEAST_LOG),
+            "verifier": max(h.verifier, LEAST_LOG),
+            "matched_fraction": r.matched_fraction,
+            "matched_outline": r.matched_outline,
+            "correlation": r.correlation,
+            "explained": r.explained,
+            "keypoints": self._keypoint_agreement(candidate, view),
+            "segmenter_class": float(np.log(max(view.sighting.class_probabilities.get(h.part, 0.0), LEAST_CLASS))),
+        }
+        return np.array([known.get(name, 0.0) for name in FEATURES])
 
-    def _keypoint_agreement(self, candidate: Candidate, small: Intrinsics, T_cam_table: Array) -> float:
+    def _keypoint_agreement(self, candidate: Candidate, view: CropView) -> float:
         """Minus the mean distance, camera pixels, from the voted keypoints to those of the candidate."""
         if candidate.keypoints is None:
             return -self.config.keypoint_limit_px
-        at = small.project(apply(candidate.T_cam_part(T_cam_table), candidate.face.part.keypoints))
+        at = view.small.project(apply(candidate.T_cam_part(view.T_cam_table), candidate.face.part.keypoints))
         distance = HALF * np.linalg.norm(at - candidate.keypoints.pixels, axis=1)
         return -float(np.minimum(distance, self.config.keypoint_limit_px).mean())
 
-    def _choose(self, candidates: Sequence[Candidate], reading: CropReading) -> CropPose:
+    def _unrefined(self, view: CropView) -> Candidate:
+        """The likeliest hypothesis as it stands, with the scores of a contour that is not there."""
+        h = view.reading.hypotheses[0]
+        face = self.nets.table[self.nets.table.index_of(h.part, h.stable_pose)]
+        x, y = view.place(h, face)
+        start = Refinement(
+            x=x,
+            y=y,
+            yaw=h.yaw,
+            covariance=np.diag(np.square([5e-4, 5e-4, 0.1])),
+            matched_fraction=0.0,
+            matched_outline=0.0,
+            correlation=0.0,
+            explained=0.0,
+        )
+        candidate = Candidate(face=face, refinement=start, evidence=np.zeros(len(FEATURES)), keypoints=None, first=True)
+        return replace(candidate, evidence=self._evidence(view, h, candidate))
+
+    def _choose(self, candidates: Sequence[Candidate], view: CropView, sure: bool) -> CropPose:
         evidence = np.stack([c.evidence for c in candidates])
         prior = np.log([max(c.face.stable_pose.probability, 1e-2) for c in candidates])
         scores = self.weights.scores(evidence) + self.config.prior_weight * prior
         best = int(scores.argmax())
-        gate = gate_evidence(scores, evidence, best, reading.not_a_part)
+        at = candidates[best].placement
+        rivals = np.array([not same_reading(self.nets.table, at, c.placement, SAME_PLACE_M) for c in candidates])
+        context = view.context
+        gate = gate_evidence(scores, evidence, best, rivals, context)
         return CropPose(
             candidates=tuple(candidates),
             scores=scores,
             best=best,
             probability=float(self.weights.probability_right(gate)),
+            part_probability=float(self.weights.probability_part(gate)),
             gate_evidence=gate,
-            not_a_part=reading.not_a_part,
+            context=context,
+            sure=sure and self._borne_out(candidates, scores),
         )
 
-
-def _half(crop: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if crop.shape[:2] != (CROP_PX, CROP_PX):
-        raise ValueError(f"a crop of {crop.shape[1]} x {crop.shape[0]} pixels; expected {CROP_PX} x {CROP_PX}")
-    side = CROP_PX // HALF
-    return np.asarray(cv2.resize(crop, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
+    def _borne_out(self, candidates: Sequence[Candidate], scores: Array) -> bool:
+        """Whether the contour of the likeliest hypothesis is good enough to look at no other."""
+        _, best = max(((score, c) for score, c in zip(scores, candidates, strict=True) if c.first), key=lambda p: p[0])
+        r, config = best.refinement, self.config
+        return bool(
+            r.matched_fraction >= config.sure_matched
+            and r.explained >= config.sure_explained
+            and best.evidence[FEATURES.index("overlap")] >= config.sure_overlap
+        )
 
 
 def _same_pose(a: Candidate, b: Candidate) -> bool:

@@ -50,12 +50,24 @@ def halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PoseAlternative:
+    """A pose that a view leaves open: part, stable pose, ``T_cam_part`` (4, 4), and its probability among them all."""
+
+    part: str
+    stable_pose: int
+    T_cam_part: Array
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class PartEstimate:
     """One part seen in a frame.
 
-    ``covariance`` (6, 6) is of (translation m, rotation vector rad), both in ``cam``. ``verdict`` is "accepted" or the
-    reason why not. ``raw_T_cam_part`` is the pose before stable-pose, plane and contour refinement.
-    ``mask`` (h, w) bool covers the frame's pixels from ``mask_origin`` (u, v) on.
+    ``score`` is the probability that the pose is right and good enough to act on. ``covariance`` (6, 6) is of
+    (translation m, rotation vector rad), both in ``cam``. ``verdict`` is "accepted" or the reason why not.
+    ``raw_T_cam_part`` is the pose before stable-pose, plane and contour refinement. ``mask`` (h, w) bool covers the
+    frame's pixels from ``mask_origin`` (u, v) on. ``alternatives`` are the poses that the view leaves open, this one
+    first; more than one says that the view cannot tell.
     """
 
     part: str
@@ -68,6 +80,7 @@ class PartEstimate:
     mask: NDArray[np.bool_] | None = None
     mask_origin: tuple[int, int] = (0, 0)
     details: dict[str, float] = field(default_factory=dict)
+    alternatives: tuple[PoseAlternative, ...] = ()
 
     @property
     def accepted(self) -> bool:

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.parts import part_names as all_part_names
-from cad.spatial import Array, Intrinsics, apply
+from cad.spatial import Array, Intrinsics
 from cad.tagboard import TagboardConfig
-from perception.calibration import camera_from_tags, table_from_board
-from perception.choice import ChoiceWeights
-from perception.crop_poses import CROP_PX, HALF, Candidate, CropPose, CropPoseConfig, CropSolver
+from perception.calibration import TagPose, camera_from_tags, table_from_board
+from perception.choice import GATE_FEATURES, MAX_LEAD, ChoiceWeights
+from perception.covariance import pose_covariance
+from perception.crop_poses import Candidate, CropPose, CropPoseConfig, CropSolver
+from perception.crop_view import CROP_PX, HALF
 from perception.estimates import (
     ACCEPTED,
     AMBIGUOUS,
@@ -34,37 +36,46 @@ from perception.estimates import (
 from perception.pnp import PnpError, solve_pnp
 from perception.posenets import PoseNets
 from perception.segmentation import Detection, Segmenter
+from perception.sighting import sighting_of
 from perception.silhouette import silhouette_mask
 from perception.standard_view import frame_scale, standard_crop
 
+LEAD = GATE_FEATURES.index("lead")
 WEIGHTS = Path(__file__).parent / "weights"
 """The weights that come with the package."""
 
-WEIGHT_FILES = (
+NETWORK_FILES = (
     "segmentation.safetensors",
     "classifier.safetensors",
     "verifier.safetensors",
     "keypoints.safetensors",
-    "choice.json",
 )
+CHOICE_FILE = "choice.json"
+WEIGHT_FILES = (*NETWORK_FILES, CHOICE_FILE)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorConfig:
-    """``overlap`` is the share of the smaller silhouette from which two estimates are one part seen twice.
+    """``overlap`` is the share of the smaller silhouette from which two estimates are one part seen twice."""
 
-    ``plane_sigma_m`` and ``lean_sigma`` (rad) are standard deviations of what the resting pose takes as exact: the
-    height of the table at the part, and the part's lean on it. They enter the covariance.
-    """
-
-    crop_poses: CropPoseConfig = field(default_factory=lambda: CropPoseConfig(prior_weight=1.0))
+    crop_poses: CropPoseConfig = field(default_factory=CropPoseConfig)
     overlap: float = 0.3
-    plane_sigma_m: float = 3e-5
-    lean_sigma: float = float(np.radians(0.15))
 
     def __post_init__(self) -> None:
         if not 0.0 < self.overlap <= 1.0:
             raise ValueError(f"overlap = {self.overlap}: must be above 0 and at most 1")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look:
+    """A frame's tags and table, the segmenter's detections, and of each the camera of its crop and what it may be."""
+
+    tags: TagPose
+    T_cam_table: Array
+    detections: tuple[Detection, ...]
+    intrinsics: tuple[Intrinsics, ...]
+    poses: tuple[CropPose, ...]
+    seconds: dict[str, float]
 
 
 class LearnedEstimator:
@@ -77,22 +88,24 @@ class LearnedEstimator:
         part_names: Sequence[str] | None = None,
         config: EstimatorConfig | None = None,
         parts_dir: Path | None = None,
+        choice: ChoiceWeights | None = None,
     ) -> None:
         """Load the weights in ``weights_dir`` (those of the package by default).
 
         ``part_names`` are the parts that may be in a frame (default: all that the networks know); an estimate of
-        another one is not accepted. Raises PerceptionError naming the folder and how to train when weights are missing,
-        or do not fit the parts.
+        another one is not accepted. ``choice`` replaces what ``choice.json`` says. Raises PerceptionError naming the
+        folder and how to train when weights are missing, or do not fit the parts.
         """
         folder = weights_dir or WEIGHTS
-        missing = [name for name in WEIGHT_FILES if not (folder / name).exists()]
+        wanted = WEIGHT_FILES if choice is None else NETWORK_FILES
+        missing = [name for name in wanted if not (folder / name).exists()]
         if missing:
             raise PerceptionError(f"no {', '.join(missing)} in {folder}; train the networks with `tagcell train`")
         self.config = config or EstimatorConfig()
         self.tagboard = tagboard or TagboardConfig()
         self.segmenter = Segmenter.load(folder, parts_dir)
         self.solver = CropSolver(
-            PoseNets.load(folder, parts_dir), ChoiceWeights.load(folder / "choice.json"), self.config.crop_poses
+            PoseNets.load(folder, parts_dir), choice or ChoiceWeights.load(folder / CHOICE_FILE), self.config.crop_poses
         )
         known = [part.name for part in self.solver.nets.table.parts]
         self.part_names = tuple(part_names or known)
@@ -109,6 +122,24 @@ class LearnedEstimator:
 
         Raises PerceptionError when the frame shows too few tags or is smaller than a crop.
         """
+        seen = self.look(frame)
+        started = time.perf_counter()
+        parts = [
+            self._estimate(frame, pose, k, seen.T_cam_table)
+            for pose, k in zip(seen.poses, seen.intrinsics, strict=True)
+        ]
+        distinct = drop_repeated(parts, self.config.overlap)
+        seen.seconds["outcome"] = time.perf_counter() - started
+        return FrameEstimate(
+            T_cam_board=seen.tags.T_cam_board,
+            parts=tuple(distinct),
+            tags_seen=seen.tags.tags_seen,
+            tag_rms_px=seen.tags.rms_px,
+            seconds=seen.seconds,
+        )
+
+    def look(self, frame: Frame) -> Look:
+        """What is seen in a frame before it is decided what of it to report; raises as ``estimate`` does."""
         seconds: dict[str, float] = {}
         started = time.perf_counter()
         tags = camera_from_tags(frame, self.tagboard)
@@ -121,17 +152,17 @@ class LearnedEstimator:
         seconds["segmentation"] = time.perf_counter() - started
 
         crops, intrinsics = cut_crops(frame, detections, scale)
-        solved = self.solver.solve(crops, intrinsics, [T_cam_table] * len(crops), seconds)
-
-        started = time.perf_counter()
-        parts = [self._estimate(frame, pose, k, T_cam_table) for pose, k in zip(solved, intrinsics, strict=True)]
-        distinct = drop_repeated(parts, self.config.overlap)
-        seconds["outcome"] = time.perf_counter() - started
-        return FrameEstimate(
-            T_cam_board=tags.T_cam_board,
-            parts=tuple(distinct),
-            tags_seen=tags.tags_seen,
-            tag_rms_px=tags.rms_px,
+        sightings = [
+            sighting_of(detection, self.segmenter.part_names, frame.intrinsics, k.downscaled(HALF))
+            for detection, k in zip(detections, intrinsics, strict=True)
+        ]
+        poses = self.solver.solve(crops, intrinsics, T_cam_table, sightings, tags.rms_px, seconds)
+        return Look(
+            tags=tags,
+            T_cam_table=T_cam_table,
+            detections=tuple(detections),
+            intrinsics=tuple(intrinsics),
+            poses=tuple(poses),
             seconds=seconds,
         )
 
@@ -140,19 +171,22 @@ class LearnedEstimator:
         T_cam_part = winner.T_cam_part(T_cam_table)
         mask, origin = silhouette_mask(winner.face.part, T_cam_part, frame.intrinsics)
         r = winner.refinement
+        alternatives = self.solver.alternatives(pose, T_cam_table)
         return PartEstimate(
             part=winner.face.part.name,
             T_cam_part=T_cam_part,
             stable_pose=winner.face.stable_pose.index,
             score=pose.probability,
-            verdict=self._verdict(pose),
-            covariance=self._covariance(winner, T_cam_table, T_cam_part),
+            verdict=self._verdict(pose, len(alternatives)),
+            covariance=pose_covariance(
+                r.covariance, self.solver.weights.noise_of(winner.face.part.name), T_cam_table, T_cam_part, r.x, r.y
+            ),
             raw_T_cam_part=_raw_pose(winner, intrinsics.downscaled(HALF)),
             mask=mask,
             mask_origin=origin,
             details={
-                "lead": float(pose.gate_evidence[1]),
-                "not_a_part": pose.not_a_part,
+                "lead": float(pose.gate_evidence[LEAD]),
+                "not_a_part": 1.0 - pose.part_probability,
                 "matched_fraction": r.matched_fraction,
                 "correlation": r.correlation,
                 "explained": r.explained,
@@ -160,38 +194,21 @@ class LearnedEstimator:
                 "y_m": r.y,
                 "yaw": r.yaw,
             },
+            alternatives=alternatives,
         )
 
-    def _verdict(self, pose: CropPose) -> str:
-        if pose.not_a_part > 0.5:
+    def _verdict(self, pose: CropPose, open_poses: int) -> str:
+        weights = self.solver.weights
+        if pose.part_probability < weights.part_above:
             return NOT_A_PART
         if pose.winner.face.part.name not in self.part_names:
             return OTHER_PART
-        if pose.probability > self.solver.weights.accept_above:
-            return ACCEPTED
+        if pose.probability > weights.accept_above:
+            return ACCEPTED if open_poses == 1 else AMBIGUOUS
         # What would have to be better: the lead over the other readings, or the contour itself?
         sure = pose.gate_evidence.copy()
-        sure[1] = max(sure[1], 4.0)
-        return (
-            AMBIGUOUS
-            if self.solver.weights.probability_right(sure) > self.solver.weights.accept_above
-            else (POOR_CONTOUR)
-        )
-
-    def _covariance(self, winner: Candidate, T_cam_table: Array, T_cam_part: Array) -> Array:
-        """Covariance (6, 6) of (translation, rotation vector) in ``cam`` from that of (x, y, yaw), height and lean."""
-        R = T_cam_table[:3, :3]
-        r = winner.refinement
-        arm = T_cam_part[:3, 3] - apply(T_cam_table, [r.x, r.y, 0.0])  # from the footprint's centre to the origin
-        J = np.zeros((6, 6))  # columns: x, y, yaw, height, lean about the table's x and y
-        J[:3, 0], J[:3, 1], J[:3, 3] = R.T
-        for column, axis in ((2, R[:, 2]), (4, R[:, 0]), (5, R[:, 1])):
-            J[:3, column], J[3:, column] = np.cross(axis, arm), axis
-        inner = np.zeros((6, 6))
-        inner[:3, :3] = r.covariance
-        inner[3, 3] = self.config.plane_sigma_m**2
-        inner[4, 4] = inner[5, 5] = self.config.lean_sigma**2
-        return J @ inner @ J.T
+        sure[LEAD] = MAX_LEAD
+        return AMBIGUOUS if weights.probability_right(sure) > weights.accept_above else POOR_CONTOUR
 
 
 def _raw_pose(winner: Candidate, small: Intrinsics) -> Array | None:
@@ -220,7 +237,7 @@ def cut_crops(
 def drop_repeated(parts: Sequence[PartEstimate], overlap: float) -> list[PartEstimate]:
     """Estimates sorted with the accepted first and by score, without those that lie on a better one's silhouette."""
     kept: list[PartEstimate] = []
-    for part in sorted(parts, key=lambda p: (not p.accepted, -p.score)):
+    for part in sorted(parts, key=lambda p: (not p.accepted, p.verdict == NOT_A_PART, -p.score)):
         if not any(_overlap(part, other) > overlap for other in kept):
             kept.append(part)
     return kept

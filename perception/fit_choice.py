@@ -1,169 +1,297 @@
-"""Fits the choice among hypotheses and its gate on full-resolution validation crops with ground truth.
+"""Fits the choice among hypotheses, its gate, its prediction set and the noise of poses on whole validation frames.
 
-The crops are split in two: the choice is fitted on one part, the gate and its threshold on the other, so that the gate
-sees winners as they come on data that the choice was not fitted on.
+The frames go through the pipeline itself, so that the gate sees real detections, false ones too. They are dealt into
+folds. For every fold the choice is fitted on one half of the other folds and the gate on the other half; what they say
+of the fold is said of frames that neither has seen, and on all of that the threshold is set. What is kept is then
+fitted on all frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cad.spatial import Array, Intrinsics
+from cad.spatial import Array
+from perception.alternatives import likely_readings, reading_probabilities
 from perception.bop_files import manifest_hash
-from perception.choice import (
-    FEATURES,
-    GATE_FEATURES,
-    ChoiceWeights,
+from perception.choice import NEUTRAL, ChoiceWeights, gate_evidence
+from perception.choice_evidence import CropFindings, FrameFindings, collect
+from perception.choice_models import (
+    cautious_threshold,
     fit_choice_weights,
-    fit_gate,
-    gate_evidence,
-    threshold_for,
+    fit_logistic,
+    fit_temperature,
+    wrong_share_bound,
 )
-from perception.crop_poses import CROP_PX, Candidate, CropPoseConfig, CropSolver
-from perception.dataset import CropSet, Labels, load_crops
+from perception.covariance import fit_noise, normalised_squares
+from perception.crop_poses import SAME_PLACE_M
 from perception.estimates import PerceptionError
-from perception.posenets import PoseNets
-
-NEUTRAL = ChoiceWeights(
-    choice=dict.fromkeys(FEATURES, 0.0) | {"classifier": 1.0, "verifier": 1.0, "matched_fraction": 3.0},
-    gate=dict.fromkeys(GATE_FEATURES, 0.0),
-    accept_above=0.5,
-)
-"""Stand-ins while evidence is collected: they only order hypotheses."""
-
-RIGHT_YAW = np.radians(6.0)
-RIGHT_PLACE_M = 1.5e-4
-"""What the choice is to find: the right face and yaw, in the right place among rims and shadows."""
-USABLE_PLACE_M = 3e-4
-"""What the gate is to predict: a pose good enough for placing a part."""
-BATCH = 32
+from perception.estimator import CHOICE_FILE, EstimatorConfig
+from perception.risk import risk_coverage
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChoiceFitConfig:
-    """``data`` is a data set of full-resolution crops (256 x 256), ``out`` the folder with the networks' weights, to
-    which ``choice.json`` is written. ``choice_share`` of the crops are for the choice, the others for the gate.
+    """``data`` are data sets of whole frames with ground truth, of any domains, ``out`` the folder with the networks'
+    weights, to which ``choice.json`` is written. Findings are kept in ``cache``, by default beside it.
 
-    ``wanted_right`` is the share of usable ones that the gate asks of accepted estimates; ``refined`` and ``nats`` are
-    as in CropPoseConfig.
+    Of accepted estimates ``wanted_right`` are to have the right branch and be usable: so that the Clopper-Pearson bound
+    with ``confidence`` of the share that is not stays below the rest. ``covered`` is how often the prediction set is to
+    hold the right reading. ``jobs`` processes run with one thread each.
     """
 
-    data: Path
+    data: tuple[Path, ...]
     out: Path
-    choice_share: float = 0.6
-    wanted_right: float = 0.98
-    refined: int = 3
-    nats: float = 6.0
+    cache: Path | None = None
+    wanted_right: float = 0.995
+    confidence: float = 0.5
+    covered: float = 0.99
+    folds: int = 5
+    jobs: int = 2
+    parts_dir: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in ("choice_share", "wanted_right"):
+        for name in ("wanted_right", "confidence", "covered"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be between 0 and 1")
+        if self.folds < 3 or self.jobs < 1:
+            raise ValueError(f"folds {self.folds} must be at least 3, jobs {self.jobs} at least 1")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CropEvidence:
-    """One crop's hypotheses: evidence (H, F), which are right, and which are usable (H,).
-
-    ``not_a_part`` is the networks' probability that there is none, ``has_part`` the truth.
+class Winners:
+    """The winners of N crops: the gate's evidence (N, G), which are right and usable, which crops show a part (N,), and
+    the probabilities (N,) of both by models that have not seen their frames.
     """
 
     evidence: Array
-    right: NDArray[np.bool_]
     usable: NDArray[np.bool_]
-    not_a_part: float
-    has_part: bool
+    has_part: NDArray[np.bool_]
+    probability: Array = field(default_factory=lambda: np.zeros(0))
+    part_probability: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def collect_evidence(solver: CropSolver, crops: CropSet, report: Callable[[str], None] = print) -> list[CropEvidence]:
-    """Evidence for all refined hypotheses of full-resolution crops, judged by their ground truth."""
-    if crops.images.shape[1:3] != (CROP_PX, CROP_PX):
-        raise PerceptionError(
-            f"crops of {crops.images.shape[2]} x {crops.images.shape[1]} pixels; the choice is fitted on "
-            f"full-resolution crops of {CROP_PX} x {CROP_PX}: render them with `tagcell render --recipe val_fine`"
+def winner_of(crop: CropFindings, weights: ChoiceWeights) -> tuple[int, Array, Array]:
+    """Index of a crop's winner, the scores (H,) and the gate's evidence for it, as the pipeline would have them: of a
+    crop that it is sure of it knows the first hypothesis alone. Scores of what it does not know are minus infinity.
+    """
+    evidence = np.array(crop.evidence)
+    known = np.array(crop.first) if crop.sure else np.ones(len(evidence), bool)
+    scores = np.where(known, weights.scores(evidence), -np.inf)
+    best = int(scores.argmax())
+    apart = np.hypot(*(np.array(crop.place) - crop.place[best]).T) > SAME_PLACE_M
+    rivals = ((np.array(crop.reading) != crop.reading[best]) | apart) & known
+    return (
+        best,
+        scores,
+        gate_evidence(scores, np.where(known[:, None], evidence, evidence[best]), best, rivals, crop.context),
+    )
+
+
+def choice_of(crops: Sequence[CropFindings]) -> dict[str, float]:
+    """Weights of the choice."""
+    shown = [c for c in crops if c.part]
+    return fit_choice_weights([np.array(c.evidence) for c in shown], [np.array(c.right) for c in shown])
+
+
+def winners_of(crops: Sequence[CropFindings], weights: ChoiceWeights) -> Winners:
+    """The winners under the weights of a choice."""
+    found = [winner_of(crop, weights) for crop in crops]
+    return Winners(
+        evidence=np.stack([gate for *_, gate in found]),
+        usable=np.array([crop.usable[best] for crop, (best, *_) in zip(crops, found, strict=True)]),
+        has_part=np.array([bool(crop.part) for crop in crops]),
+    )
+
+
+def cross_fitted(frames: Sequence[Sequence[CropFindings]], folds: int) -> tuple[Winners, list[Array]]:
+    """All crops' winners with the probabilities and scores of models that have not seen their frames.
+
+    Of the frames that are not in a fold every other one is for the choice, the rest for gate and part.
+    """
+    parts, scores = [], []
+    for fold in range(folds):
+        rest = [frame for i, frame in enumerate(frames) if i % folds != fold]
+        mine = [crop for frame in frames[fold::folds] for crop in frame]
+        weights = replace(NEUTRAL, choice=choice_of([crop for frame in rest[::2] for crop in frame]))
+        seen = winners_of([crop for frame in rest[1::2] for crop in frame], weights)
+        weights = replace(
+            weights,
+            gate=fit_logistic(seen.evidence, seen.usable),
+            part=fit_logistic(seen.evidence, seen.has_part),
         )
-    truth = crops.labels(solver.nets.table.parts)
-    out: list[CropEvidence] = []
-    for start in range(0, len(crops), BATCH):
-        rows = range(start, min(start + BATCH, len(crops)))
-        cameras = [_camera(crops.K[i]) for i in rows]
-        tables = [truth.T_cam_table[i] for i in rows]
-        for i, pose in zip(rows, solver.solve(crops.images[start : rows.stop], cameras, tables), strict=True):
-            out.append(
-                CropEvidence(
-                    evidence=np.stack([c.evidence for c in pose.candidates]),
-                    right=np.array([_is_right(solver, crops, truth, i, c, RIGHT_PLACE_M) for c in pose.candidates]),
-                    usable=np.array([_is_right(solver, crops, truth, i, c, USABLE_PLACE_M) for c in pose.candidates]),
-                    not_a_part=pose.not_a_part,
-                    has_part=bool(truth.part_index[i] >= 0),
-                )
+        new = winners_of(mine, weights)
+        parts.append(
+            replace(
+                new,
+                probability=weights.probability_right(new.evidence),
+                part_probability=weights.probability_part(new.evidence),
             )
-        report(f"choice: {rows.stop} of {len(crops)} crops")
+        )
+        scores += [winner_of(crop, weights)[1] for crop in mine]
+    joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Winners.__dataclass_fields__}
+    return Winners(**joined), scores
+
+
+def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> tuple[ChoiceWeights, dict[str, float]]:
+    """Everything from the findings in frames, and figures on frames that the models behind them have not seen."""
+    frames = [[crop for crop in frame.crops if crop.whole] for frame in findings]
+    frames = [frame for frame in frames if frame]
+    if len(frames) < 2 * config.folds:
+        raise PerceptionError(
+            f"{len(frames)} frames with detections: {2 * config.folds} are needed to fit choice, gate and threshold on "
+            "different ones; render more frames, or lower --folds"
+        )
+    ordered = [crop for fold in range(config.folds) for frame in frames[fold :: config.folds] for crop in frame]
+    held_out, scores = cross_fitted(frames, config.folds)
+    threshold = cautious_threshold(held_out.probability, held_out.usable, config.wanted_right, config.confidence)
+    temperature, mass = _prediction_set(ordered, scores, config.covered)
+
+    choice = choice_of(ordered)
+    winners = winners_of(ordered, replace(NEUTRAL, choice=choice))
+    weights = ChoiceWeights(
+        choice=choice,
+        gate=fit_logistic(winners.evidence, winners.usable),
+        part=fit_logistic(winners.evidence, winners.has_part),
+        accept_above=threshold,
+        temperature=temperature,
+        set_mass=mass,
+        noise={part: fit_noise(*errors_of(found)) for part, found in sorted(_by_part(ordered, choice).items())},
+    )
+    return weights, _figures(findings, ordered, scores, held_out, weights)
+
+
+Winner = tuple[CropFindings, int]
+"""A crop and the index of its winner."""
+
+
+def errors_of(winners: Sequence[Winner]) -> tuple[Array, Array]:
+    """Errors (N, 6) of winners and Gauss-Newton's covariances (N, 3, 3)."""
+    errors = np.array([crop.errors[best] for crop, best in winners], np.float64).reshape(-1, 6)
+    return errors, np.array([crop.planar[best] for crop, best in winners], np.float64).reshape(-1, 3, 3)
+
+
+def _by_part(crops: Sequence[CropFindings], choice: dict[str, float]) -> dict[str, list[Winner]]:
+    """The winners that are usable, by part."""
+    weights = replace(NEUTRAL, choice=choice)
+    out: dict[str, list[Winner]] = {}
+    for crop in crops:
+        best = winner_of(crop, weights)[0]
+        if crop.errors[best] is not None:
+            out.setdefault(crop.part, []).append((crop, best))
     return out
 
 
-def _is_right(solver: CropSolver, crops: CropSet, truth: Labels, i: int, candidate: Candidate, within_m: float) -> bool:
-    """Whether a candidate is the crop's target, or looks exactly like it, and lies where it is."""
-    if truth.part_index[i] < 0:
-        return False
-    table = solver.nets.table
-    face = table.index_of(table.parts[truth.part_index[i]].name, int(crops.stable_pose[i]))
-    r = candidate.refinement
-    near = np.hypot(r.x - truth.x[i], r.y - truth.y[i]) < within_m
-    return bool(near and table.same_view(face, float(truth.yaw[i]), candidate.face.index, r.yaw, RIGHT_YAW))
-
-
-def _camera(K: Array) -> Intrinsics:
-    return Intrinsics(width=CROP_PX, height=CROP_PX, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
-
-
-def fit_weights(found: list[CropEvidence], config: ChoiceFitConfig) -> tuple[ChoiceWeights, dict[str, float]]:
-    """Choice and gate from the evidence of crops, and figures on those that the choice was not fitted on."""
-    split = int(len(found) * config.choice_share)
-    first, second = found[:split], found[split:]
-    choice = fit_choice_weights([e.evidence for e in first], [e.right for e in first])
-    weights = replace(NEUTRAL, choice=choice)
-    winners, usable = _winners(second, weights)
-    weights = replace(weights, gate=fit_gate(winners, usable))
-    probability = weights.probability_right(winners)
-    weights = replace(weights, accept_above=threshold_for(probability, usable, config.wanted_right))
-    accepted = (probability > weights.accept_above) & np.array([e.not_a_part <= 0.5 for e in second])
-    has = np.array([e.has_part for e in second])
-    figures = {
-        "crops": float(len(second)),
-        "usable": float(usable[has].mean()),
-        "best_possible": float(np.mean([e.usable.any() for e in second if e.has_part])),
-        "accepted_share": float(accepted[has].mean()),
-        "usable_of_accepted": float(usable[accepted].mean()) if accepted.any() else 0.0,
-        "empty_accepted": float(accepted[~has].mean()) if (~has).any() else 0.0,
+def normalised_errors(findings: Sequence[FrameFindings], choice: dict[str, float]) -> dict[str, dict[str, float]]:
+    """How the noise fitted on every other frame holds on the rest: by "part, domain" and by part, the number of
+    estimates and the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
+    """
+    seen: dict[str, list[tuple[float, float]]] = {}
+    for half in (0, 1):
+        fitted = {
+            part: fit_noise(*errors_of(found))
+            for part, found in _by_part([c for f in findings[half::2] for c in f.crops if c.whole], choice).items()
+        }
+        for frame in findings[1 - half :: 2]:
+            for part, found in _by_part([c for c in frame.crops if c.whole], choice).items():
+                if part in fitted:
+                    squares = zip(*normalised_squares(*errors_of(found), fitted[part]), strict=True)
+                    for pair in squares:
+                        for name in (f"{part}, {frame.domain}", part):
+                            seen.setdefault(name, []).append(pair)
+    return {
+        name: {"n": len(pairs), "planar": float(np.mean(pairs, axis=0)[0]), "pose": float(np.mean(pairs, axis=0)[1])}
+        for name, pairs in sorted(seen.items())
     }
-    return weights, figures
 
 
-def _winners(found: list[CropEvidence], weights: ChoiceWeights) -> tuple[Array, NDArray[np.bool_]]:
-    """The gate's evidence of each crop's winner (N, G), and whether it is usable (N,)."""
-    rows, usable = [], []
-    for e in found:
-        scores = weights.scores(e.evidence)
-        best = int(scores.argmax())
-        rows.append(gate_evidence(scores, e.evidence, best, e.not_a_part))
-        usable.append(bool(e.usable[best]))
-    return np.stack(rows), np.array(usable)
+def _prediction_set(crops: Sequence[CropFindings], scores: Sequence[Array], covered: float) -> tuple[float, float]:
+    """Temperature of the readings' probabilities, and the mass of a set that holds the right one as often as wanted."""
+    known = [_readings(crop, s) for crop, s in zip(crops, scores, strict=True) if crop.part]
+    known = [(best, right) for best, right in known if right.any()]
+    if not known:
+        return 1.0, 0.99
+    temperature = fit_temperature([best for best, _ in known], [right for _, right in known])
+    before = []
+    for best, right in known:
+        p = reading_probabilities(best, range(len(best)), temperature)
+        order = np.argsort(-p, kind="stable")
+        before.append(float(np.append(0.0, np.cumsum(p[order]))[int(np.argmax(right[order]))]))
+    level = min(1.0, np.ceil((len(before) + 1) * covered) / len(before))  # split conformal prediction's quantile
+    return temperature, float(np.clip(np.quantile(before, level, method="higher") + 1e-6, 0.9, 0.9999))
+
+
+def _readings(crop: CropFindings, scores: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """The best score (R,) of each reading that the pipeline knows, and which is right."""
+    known = np.isfinite(scores)
+    numbers = sorted({n for n, k in zip(crop.reading, known, strict=True) if k})
+    of = [[i for i, n in enumerate(crop.reading) if n == number and known[i]] for number in numbers]
+    right = np.array([any(crop.right_reading[i] for i in members) for members in of])
+    return np.array([scores[members].max() for members in of]), right
+
+
+def _figures(
+    findings: Sequence[FrameFindings],
+    crops: Sequence[CropFindings],
+    scores: Sequence[Array],
+    held_out: Winners,
+    weights: ChoiceWeights,
+) -> dict[str, float]:
+    has, usable = held_out.has_part, held_out.usable
+    kept = held_out.part_probability >= weights.part_above
+    accepted = (held_out.probability > weights.accept_above) & kept
+    wrong, n = int((accepted & ~usable).sum()), int(accepted.sum())
+    sets = [_readings(crop, s) for crop, s in zip(crops, scores, strict=True) if crop.part]
+    sizes, holds = [], []
+    for best, right in sets:
+        chosen = likely_readings(reading_probabilities(best, range(len(best)), weights.temperature), weights.set_mass)
+        sizes.append(len(chosen))
+        holds.append(bool(right[chosen].any()))
+    whole = sum(frame.whole_parts for frame in findings)
+    return {
+        "frames": len(findings),
+        "parts": whole,
+        "found": sum(frame.found_parts for frame in findings) / max(whole, 1),
+        "usable": float(usable[has].mean()),
+        "best_possible": float(np.mean([any(crop.usable) for crop in crops if crop.part])),
+        "sure": float(np.mean([crop.sure for crop in crops if crop.part])),
+        "accepted": float((accepted & has).sum() / max(whole, 1)),
+        "accepted_wrong": wrong,
+        "wrong_upper_95": float(wrong_share_bound(wrong, n, 0.95)) if n else 1.0,
+        "part_kept": float(kept[has].mean()),
+        "empty_kept": float(kept[~has].mean()) if (~has).any() else 0.0,
+        "excess_risk_area": risk_coverage(held_out.probability, ~usable).excess_area,
+        "set_size": float(np.mean(sizes)),
+        "set_holds": float(np.mean(holds)),
+    }
+
+
+def evidence_config(config: EstimatorConfig | None = None) -> EstimatorConfig:
+    """The pipeline's config with all readings refined, so that the choice learns from every crop."""
+    config = config or EstimatorConfig()
+    short = replace(config.crop_poses.shortlist, thorough=True)
+    return replace(config, crop_poses=replace(config.crop_poses, shortlist=short))
 
 
 def fit_choice(config: ChoiceFitConfig) -> Path:
-    """Fit on the data set and write ``choice.json`` beside the networks' weights; returns its path."""
-    solver_config = CropPoseConfig(refined=config.refined, nats=config.nats)
-    solver = CropSolver(PoseNets.load(config.out), NEUTRAL, solver_config)
-    found = collect_evidence(solver, load_crops(config.data))
-    weights, figures = fit_weights(found, config)
+    """Fit on the data sets and write ``choice.json`` beside the networks' weights; returns its path."""
+    cache = config.cache or config.out / "choice_evidence"
+    findings = collect(config.data, config.out, cache, evidence_config(), config.jobs, config.parts_dir)
+    weights, figures = fit_weights(findings, config)
+    print("normalised error squared on frames it was not fitted on (3 and 6 when the covariance holds):")
+    for name, row in normalised_errors(findings, weights.choice).items():
+        slack = 1.96 * np.sqrt(np.array([6.0, 12.0]) / row["n"])
+        print(
+            f"  {name}: {row['planar']:.2f} of 3 +- {slack[0]:.2f}, {row['pose']:.2f} of 6 +- {slack[1]:.2f}, "
+            f"{row['n']} estimates"
+        )
     summary = ", ".join(f"{name} {value:.4g}" for name, value in figures.items())
-    path = config.out / "choice.json"
-    replace(weights, fitted_on=f"{config.data.name} ({manifest_hash(config.data)}): {summary}").save(path)
+    on = ", ".join(f"{data.name} ({manifest_hash(data)})" for data in config.data)
+    path = config.out / CHOICE_FILE
+    replace(weights, fitted_on=f"{on}: {summary}").save(path)
     print(f"{path}: {summary}")
     return path

@@ -193,9 +193,24 @@ class PoseNets:
             face = self.table.index_of(hypothesis.part, hypothesis.stable_pose)
             score = float(log[view, face]) if away[view] < _SAME_YAW else _UNSEEN
             scored.append(replace(hypothesis, verifier=max(score, _UNSEEN)))
+        scored += self._unproposed(scored, views, log)
         scored.sort(key=lambda h: -h.log_probability)
         not_a_part = 0.5 * (reading.not_a_part + float(np.exp(nothing)))
         return replace(reading, hypotheses=tuple(scored), not_a_part=not_a_part)
+
+    def _unproposed(self, scored: Sequence[Hypothesis], views: Sequence[float], log: Array) -> list[Hypothesis]:
+        """V's first reading, of log-probabilities (V, F), when J proposes nothing like it and so gives it less."""
+        view, index = (int(i) for i in np.unravel_index(int(log.argmax()), log.shape))
+        face, yaw = self.table[index], float(wrap_angle(views[view]))
+        if any(
+            (h.part, h.stable_pose) == (face.part.name, face.stable_pose.index)
+            and abs(float(wrap_angle(h.yaw - yaw))) < _SAME_YAW
+            for h in scored
+        ):
+            return []
+        least = min(h.classifier for h in scored) - 1.0
+        read = replace(scored[0], part=face.part.name, stable_pose=face.stable_pose.index, yaw=yaw, classifier=least)
+        return [replace(read, verifier=max(float(log[view, index]), _UNSEEN))]
 
 
 def _ready(net: nn.Module) -> Any:

@@ -24,7 +24,16 @@ def make_part(mesh: trimesh.Trimesh, rotations: tuple[Array, ...] = (np.eye(3),)
         corners = mesh.vertices @ R.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         t = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
-        poses.append(StablePose(index=i, R_table_part=R, t_table_part=t, probability=1 / len(rotations), view_class=i))
+        poses.append(
+            StablePose(
+                index=i,
+                R_table_part=R,
+                t_table_part=t,
+                probability=1 / len(rotations),
+                view_class=i,
+                view_equivalents=(),
+            )
+        )
     return Part(
         name=name,
         obj_id=1,

@@ -36,13 +36,17 @@ def test_hypotheses_are_sorted_and_of_known_faces(nets: PoseNets) -> None:
         assert all(TABLE.index_of(h.part, h.stable_pose) >= 0 for h in reading.hypotheses)
 
 
-def test_verifying_keeps_the_hypotheses_and_sorts_them_by_the_sum(nets: PoseNets) -> None:
+def test_verifying_keeps_the_hypotheses_adds_the_verifiers_own_and_sorts_by_the_sum(nets: PoseNets) -> None:
     before = nets.hypotheses(CROPS, RAYS)
     after = nets.verify(CROPS, RAYS, before)
     for a, b in zip(before, after, strict=True):
-        assert {(h.part, h.stable_pose, h.yaw) for h in a.hypotheses} == {
-            (h.part, h.stable_pose, h.yaw) for h in b.hypotheses
-        }
+        proposed = {(h.part, h.stable_pose, h.yaw) for h in a.hypotheses}
+        added = [h for h in b.hypotheses if (h.part, h.stable_pose, h.yaw) not in proposed]
+        assert len(b.hypotheses) == len(proposed) + len(added)
+        assert len(added) <= 1
+        for h in added:
+            assert h.verifier == max(other.verifier for other in b.hypotheses)
+            assert h.classifier < min(other.classifier for other in a.hypotheses)
         scores = [h.classifier + h.verifier for h in b.hypotheses]
         assert scores == sorted(scores, reverse=True) and all(h.verifier < 0 for h in b.hypotheses)
 

@@ -1,0 +1,78 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cad.parts import planar
+from cad.spatial import rotation_from_rotvec, rotation_x, transform
+from perception.covariance import NoiseModel, fit_noise, inner_error, normalised_squares, pose_covariance
+
+T_CAM_TABLE = transform(rotation_x(np.pi + 0.02), [0.01, -0.02, 0.7])
+T_REST = transform(rotation_from_rotvec([0.4, -0.2, 0.9]), [1e-3, -5e-4, 1.5e-3])
+AT = (0.11, -0.06, 0.7)
+CONTOUR = np.diag(np.square([4e-6, 6e-6, 4e-4]))
+NOISE = NoiseModel(scale=2.0, floor_m=1e-5, floor_rad=1e-3, height_m=4e-5, lean_rad=3e-3)
+
+
+def pose(x: float, y: float, yaw: float, height: float = 0.0, lean: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """A part that leans about its foot, on a table that is higher; its foot stays on the same ray to the camera."""
+    foot = T_CAM_TABLE @ [x, y, 0.0, 1.0]
+    normal = T_CAM_TABLE[:3, 2]
+    along_ray = transform(np.eye(3), foot[:3] / (normal @ foot[:3]) * height)
+    leaning = transform(rotation_from_rotvec([*lean, 0.0]))
+    return along_ray @ T_CAM_TABLE @ planar(x, y, 0.0) @ leaning @ planar(0.0, 0.0, yaw) @ T_REST
+
+
+def test_covariance_is_that_of_sampled_poses() -> None:
+    rng, T = np.random.default_rng(0), pose(*AT)
+    stated = pose_covariance(CONTOUR, NOISE, T_CAM_TABLE, T, AT[0], AT[1])
+    flat = NOISE.scale * CONTOUR + np.diag(np.square([NOISE.floor_m, NOISE.floor_m, NOISE.floor_rad]))
+    squares = []
+    for x, y, yaw in rng.multivariate_normal(AT, flat, 3000):
+        lean = (rng.normal(0, NOISE.lean_rad), rng.normal(0, NOISE.lean_rad))
+        other = pose(x, y, yaw, rng.normal(0, NOISE.height_m), lean)
+        turn = other[:3, :3] @ T[:3, :3].T
+        rotvec = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        error = np.concatenate([other[:3, 3] - T[:3, 3], rotvec])
+        squares.append(error @ np.linalg.solve(stated, error))
+    assert np.mean(squares) == pytest.approx(6.0, abs=0.3)
+    assert np.linalg.eigvalsh(stated).min() > 0
+
+
+def test_each_cause_is_found_again_in_the_error() -> None:
+    x, y, yaw = AT
+    T = pose(x, y, yaw)
+    wrong = pose(x + 3e-5, y - 2e-5, yaw + 2e-3, 6e-5, (1e-3, -2e-3))
+    found = inner_error(wrong, T, T_CAM_TABLE, x, y)
+    np.testing.assert_allclose(found, [3e-5, -2e-5, 2e-3, 6e-5, 1e-3, -2e-3], rtol=0.02, atol=3e-7)
+
+
+def test_a_higher_table_moves_a_part_along_its_ray_alone() -> None:
+    tight = replace(NOISE, scale=1e-6, floor_m=1e-9, floor_rad=1e-9, lean_rad=1e-9)
+    C = pose_covariance(CONTOUR, tight, T_CAM_TABLE, pose(*AT), AT[0], AT[1])
+    foot = T_CAM_TABLE @ [AT[0], AT[1], 0.0, 1.0]
+    ray = foot[:3] / np.linalg.norm(foot[:3])
+    across = np.eye(3) - np.outer(ray, ray)
+    assert np.trace(across @ C[:3, :3] @ across) < 1e-4 * np.trace(C[:3, :3])
+
+
+def test_fitted_noise_holds_on_other_errors() -> None:
+    rng = np.random.default_rng(1)
+
+    def draw(n: int) -> tuple[np.ndarray, np.ndarray]:
+        contours = CONTOUR * rng.uniform(0.3, 3.0, n)[:, None, None]
+        return np.array([rng.multivariate_normal(np.zeros(6), NOISE.inner(C)) for C in contours]), contours
+
+    errors, contours = draw(300)
+    errors[:3, 0] = 2.5e-4  # a rim taken for the outline
+    fitted = fit_noise(errors, contours)
+    planar_squares, all_squares = normalised_squares(*draw(2000), fitted)
+    assert planar_squares.mean() == pytest.approx(3.0, abs=0.4)
+    assert all_squares.mean() == pytest.approx(6.0, abs=0.6)
+    assert fitted.height_m == pytest.approx(NOISE.height_m, rel=0.15)
+
+
+def test_few_errors_say_nothing() -> None:
+    assert fit_noise(np.zeros((5, 6)), np.tile(CONTOUR, (5, 1, 1))) == NoiseModel()
+    with pytest.raises(ValueError, match="floor_m"):
+        NoiseModel(floor_m=0.0)
