@@ -20,7 +20,7 @@ from perception.instance_scores import instance_scores
 from perception.metrics import summary
 from perception.outcomes import ERRORS, SYMMETRIC, Outcome
 from perception.pose_tables import ALL, error_values, pose_table
-from perception.references import GOALS, PAPER_REFINED
+from perception.references import ACCEPTED_SHARE, BAD_SHARE, GOALS, PAPER_REFINED
 
 OURS, BASELINE, BASELINE_RAW = "tagcell", "pvnet-refined", "pvnet"
 """Rows: Tagcell, and the published method with and without its refinement."""
@@ -128,7 +128,10 @@ def _ratios(
 
 
 def goals(domain: str, n_parts: int, segmentation: Mapping[str, Any], pose: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What is asked for in a domain beside what was measured over all parts; empty for a domain without goals."""
+    """What is asked for in a domain beside what was measured over all parts; empty for a domain without goals.
+
+    Figures that are not known reach nothing.
+    """
     accepted, right = (pose["refined"][name][SYMMETRIC] for name in ("accepted", "accepted_right"))
     wide, interval = segmentation["intervals_95"], pose["intervals_95"]
     measured = [
@@ -149,7 +152,7 @@ def goals(domain: str, n_parts: int, segmentation: Mapping[str, Any], pose: Mapp
             "wanted": goal.wanted(),
             "measured": value,
             "interval_95": bounds,
-            "met": goal.met(value),
+            "met": goal.met(value) and (goal.name != ACCEPTED_SHARE or pose["bad_share"] <= BAD_SHARE),
         }
         for goal, (value, bounds) in zip(GOALS.get(domain, ()), measured, strict=False)
     ]

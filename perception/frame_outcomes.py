@@ -28,6 +28,7 @@ from perception.pose_comparison import (
     choice_of,
     errors_by_comparison,
     normalised_errors_squared,
+    reading_right,
     same_views,
     surface_error_mm,
 )
@@ -120,6 +121,8 @@ class Judge:
             face_right=choice.face_right,
             branch_right=choice.branch_right,
             branch_right_equivalent=choice.branch_right_equivalent,
+            readings=max(1, len(estimate.alternatives)),
+            reading_right=reading_right(part, views, estimate, truth.T_cam_board),
             yaw_error_deg=choice.yaw_error_deg,
             errors=errors_by_comparison(part, views, estimate.part, estimate.T_cam_part),
             raw_errors=errors_by_comparison(part, views, raw.part, raw.T_cam_part) if raw is not None else None,

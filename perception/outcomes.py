@@ -35,9 +35,10 @@ class Outcome:
     pixels square round it. About the estimate that belongs to it, if it was ``detected``: overlap of the masks, score,
     verdict, what it was taken for, whether class, face (class and stable pose) and branch (face, and yaw within 6
     degrees) are right, and the errors: absolute differences in the camera frame and the angle between the orientations,
-    by comparison. ``raw_errors`` are those before refinement. ``yaw_error_deg`` (signed, modulo symmetries) is there
-    when the face is right. ``mssd_mm`` is there when the class is right, ``nees`` (6 degrees of freedom) and
-    ``nees_planar`` (3: x, y, yaw) when the branch is right and there is a covariance.
+    by comparison. ``raw_errors`` are those before refinement. ``readings`` is the number of poses that the estimate
+    leaves open, ``reading_right`` whether the branch of one of them is right (view-equivalent). ``yaw_error_deg``
+    (signed, modulo symmetries) is there when the face is right, ``mssd_mm`` when the class is, ``nees`` (6 degrees of
+    freedom) and ``nees_planar`` (3: x, y, yaw) when the branch is and there is a covariance.
 
     Of a part that was not detected ``verdict`` says "missed", or "not a part" when an estimate of it was rejected so.
     """
@@ -64,6 +65,8 @@ class Outcome:
     face_right: bool = False
     branch_right: bool = False
     branch_right_equivalent: bool = False
+    readings: int = 1
+    reading_right: bool = False
     yaw_error_deg: float | None = None
     errors: dict[str, Errors] | None = None
     raw_errors: dict[str, Errors] | None = None

@@ -92,6 +92,17 @@ def choice_of(truth: TruePart, views: list[Placement], estimate: PartEstimate, T
     )
 
 
+def reading_right(truth: TruePart, views: list[Placement], estimate: PartEstimate, T_cam_board: Array) -> bool:
+    """Whether the branch of one of the poses that an estimate leaves open is right, view-equivalent."""
+    readings = [
+        replace(estimate, part=a.part, stable_pose=a.stable_pose, T_cam_part=a.T_cam_part)
+        for a in estimate.alternatives
+    ]
+    return any(
+        choice_of(truth, views, reading, T_cam_board).branch_right_equivalent for reading in (estimate, *readings)
+    )
+
+
 def _yaw_error_deg(truth: TruePart, view: Placement, estimate: PartEstimate, T_cam_board: Array) -> float:
     """Signed yaw about the board's normal from the view to the estimate, modulo what the part at rest has the same."""
     alike = truth.part.rest_symmetries(view.stable_pose)
@@ -141,4 +152,10 @@ def as_raw(estimate: PartEstimate) -> PartEstimate | None:
     """The estimate as it was before refinement; None where it had no pose then."""
     if estimate.raw_T_cam_part is None:
         return None
-    return replace(estimate, T_cam_part=estimate.raw_T_cam_part, raw_T_cam_part=None, covariance=np.zeros((6, 6)))
+    return replace(
+        estimate,
+        T_cam_part=estimate.raw_T_cam_part,
+        raw_T_cam_part=None,
+        covariance=np.zeros((6, 6)),
+        alternatives=(),
+    )

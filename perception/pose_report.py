@@ -94,17 +94,21 @@ def decisions(tables: Tables) -> str:
                     str(p["n_parts"]),
                     *(share(p[s]) for s in ("missed_share", *shares, "accepted_share")),
                     f"{p['n_bad']} of {p['n_accepted']}",
+                    str(p["n_strays_accepted"]),
                     *(share(p[s]) for s in ("bad_share", "bad_share_upper_95")),
+                    str(p["n_open"]),
+                    share(p["open_reading_right"]),
                 ]
             )
     header = ("", "parts", "missed", "class right", "face right", "branch right", "view-equivalent", "flipped")
-    header += ("accepted", "wrong among accepted", "share", "at most (95 %)")
+    header += ("accepted", "wrong among accepted", "of these no part", "share", "at most (95 %)")
+    header += ("left open", "set holds the right one")
     return (
         "## Class, face and yaw\n\n"
         + markdown_table(header, rows)
         + "\n\nRight and flipped: of the parts found. Branch: class, stable pose, and yaw within 6 degrees; flipped: "
         "the face is right, the yaw more than 90 degrees off. Accepted: of all parts. Wrong among accepted: another "
-        "branch than the view allows, or no part at all."
+        "branch than the view allows, or no part at all. Left open: the view cannot tell between several poses."
     )
 
 

@@ -40,7 +40,8 @@ def part_figures(rows: Sequence[Outcome], bootstrap: FrameBootstrap) -> dict[str
     """Figures of some outcomes, strays among them.
 
     Errors are {mean, std, median, p95, n}; at the top they are those of all detected parts, refined, modulo the part's
-    symmetries. ``refined`` and ``raw`` hold them by selection and comparison.
+    symmetries. ``refined`` and ``raw`` hold them by selection and comparison. ``n_open`` is the number of parts whose
+    view leaves more than one pose open, ``open_reading_right`` the share of these with the right one among them.
     """
     there = [o for o in rows if o.is_part]
     seen = [o for o in there if o.detected]
@@ -61,6 +62,8 @@ def part_figures(rows: Sequence[Outcome], bootstrap: FrameBootstrap) -> dict[str
         "branch_right": _share(o.branch_right for o in seen),
         "branch_right_equivalent": _share(o.branch_right_equivalent for o in seen),
         "branch_right_lower_95": clopper_pearson_lower(sum(o.branch_right_equivalent for o in seen), len(seen)),
+        "n_open": sum(o.readings > 1 for o in seen),
+        "open_reading_right": _share(o.reading_right for o in seen if o.readings > 1),
         "flip_rate": _share(o.flipped for o in seen),
         "flip_rate_accepted": _share(o.flipped for o in taken),
         "accepted_share": _share(o.accepted for o in there),

@@ -48,12 +48,14 @@ class Goal:
         return f"{'≥' if self.least else '≤'} {self.required:g}{aim}"
 
 
+ACCEPTED_SHARE = "accepted share"
+"""It counts as reached only if no more than BAD_SHARE of the accepted are wrong."""
 _NAMES = (
     "recall at IoU 0.5",
     "precision at IoU 0.5",
     "mask mIoU",
     "branch right, all detections",
-    "accepted share",
+    ACCEPTED_SHARE,
     "e_x mean (mm), accepted",
     "e_x p95 (mm), accepted",
     "e_y mean (mm), accepted",

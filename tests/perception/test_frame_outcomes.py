@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_frames import LAYOUT, estimate_of, frame_of, moved, pose_of, seen
 
-from perception.estimates import NOT_A_PART
+from perception.estimates import NOT_A_PART, PoseAlternative
 from perception.faces import FaceTable
 from perception.frame_outcomes import Judge
 from perception.outcomes import COMPARISONS
@@ -127,3 +127,16 @@ def test_raw_poses_that_are_not_known_have_no_errors(truth) -> None:
 def test_details_that_are_no_numbers_are_left_out(truth) -> None:
     o = rows(truth, estimate_of(truth.parts[0], details={"lead": np.float32(2.0), "lost": float("nan")}))[0]
     assert o.details == {"lead": 2.0}
+
+
+def test_a_view_that_leaves_the_right_pose_open_is_not_lost(truth) -> None:
+    name, stable_pose, x, y, yaw = LAYOUT[1]
+    turned = pose_of((name, stable_pose, x, y, yaw + np.pi))
+    part = truth.parts[1]
+    wrong = PoseAlternative(part=name, stable_pose=stable_pose, T_cam_part=turned, probability=0.6)
+    right = replace(wrong, T_cam_part=part.T_cam_part, probability=0.4)
+    o = rows(truth, estimate_of(part, turned, alternatives=(wrong, right)))[1]
+    assert (o.readings, o.reading_right, o.branch_right) == (2, True, False)
+    o = rows(truth, estimate_of(part, turned, alternatives=(wrong,)))[1]
+    assert (o.readings, o.reading_right) == (1, False)
+    assert rows(truth, estimate_of(part))[1].reading_right
