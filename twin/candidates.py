@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,11 +17,25 @@ from twin.grasp_choice import PlacedPart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Reading:
+    """One way to read what a look shows: ``T_base_part`` (4, 4) of a part in a stable pose, and how probable it is."""
+
+    part: Part
+    stable_pose: int
+    T_base_part: Array
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """An estimate brought down to the board plane, and the reason why it cannot be used, if there is one."""
+    """An estimate brought down to the board plane, and the reason why it cannot be used, if there is one.
+
+    ``readings`` are all that the look leaves open, the estimate's own first.
+    """
 
     estimate: PartEstimate
     placed: PlacedPart
+    readings: tuple[Reading, ...]
     problem: tuple[Outcome, str] | None = None
 
     @cached_property
@@ -36,10 +51,18 @@ class Candidate:
 
 
 def bring_down(
-    estimate: PartEstimate, part: Part, T_base_cam: Array, calibration: Calibration, config: ControllerConfig
+    estimate: PartEstimate,
+    parts: Mapping[str, Part],
+    T_base_cam: Array,
+    calibration: Calibration,
+    config: ControllerConfig,
 ) -> Candidate:
-    """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's."""
-    pose, T_base_board = part.stable_poses[estimate.stable_pose], calibration.T_base_board
+    """The estimate as a part that lies on the board: x, y and yaw are kept, the rest is the stable pose's.
+
+    ``parts`` by name hold the estimate's; a reading of another one is left out.
+    """
+    part, T_base_board = parts[estimate.part], calibration.T_base_board
+    pose = part.stable_poses[estimate.stable_pose]
     T_board_part = as_rest(part, pose, inverse(T_base_board) @ T_base_cam @ estimate.T_cam_part)
     flat = settled(pose, T_board_part)
     tilt = rotation_angle(flat[:3, :3], T_board_part[:3, :3])
@@ -53,4 +76,15 @@ def bring_down(
     elif abs(x) > calibration.board_half_m[0] or abs(y) > calibration.board_half_m[1]:
         problem = "pose", f"at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm on the board, outside the pick area"
     placed = PlacedPart(part=part, T_base_part=T_base_board @ flat)
-    return Candidate(estimate=estimate, placed=placed, problem=problem)
+    return Candidate(estimate=estimate, placed=placed, readings=_readings(estimate, parts, T_base_cam), problem=problem)
+
+
+def _readings(estimate: PartEstimate, parts: Mapping[str, Part], T_base_cam: Array) -> tuple[Reading, ...]:
+    """Of an estimate that names no alternatives its own reading, as probable as its score says."""
+    named = [(a.part, a.stable_pose, a.T_cam_part, a.probability) for a in estimate.alternatives]
+    return tuple(
+        Reading(part=parts[name], stable_pose=k, T_base_part=T_base_cam @ T_cam_part, probability=probability)
+        for name, k, T_cam_part, probability in named
+        or [(estimate.part, estimate.stable_pose, estimate.T_cam_part, estimate.score)]
+        if name in parts
+    )

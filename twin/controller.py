@@ -131,7 +131,7 @@ class PickController:
         self._on_event(Looked(frame=frame, estimate=estimate, view=str(view)))
         T_base_cam = self._calibration.T_base_board @ inverse(estimate.T_cam_board)
         candidates = [
-            bring_down(seen, self._parts[seen.part], T_base_cam, self._calibration, self._config)
+            bring_down(seen, self._parts, T_base_cam, self._calibration, self._config)
             for seen in estimate.parts
             if seen.part in self._parts
         ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin.candidates import Candidate
+from twin.candidates import Reading
 
 SAME_RAD = float(np.radians(15.0))
 """Yaws within this angle are one reading."""
@@ -14,29 +14,29 @@ FLOOR = 0.02
 """No single look is surer of or against a reading than this."""
 
 
-def same_reading(a: Candidate, b: Candidate) -> bool:
+def same_reading(a: Reading, b: Reading) -> bool:
     """Whether both are the same part in the same stable pose and yaw branch, modulo what leaves it at rest the same."""
-    if a.estimate.part != b.estimate.part or a.estimate.stable_pose != b.estimate.stable_pose:
+    if a.part is not b.part or a.stable_pose != b.stable_pose:
         return False
-    alike = a.placed.part.rest_symmetries(a.estimate.stable_pose)
-    return alike.difference(a.placed.T_base_part, b.placed.T_base_part)[1] < SAME_RAD
+    return a.part.rest_symmetries(a.stable_pose).difference(a.T_base_part, b.T_base_part)[1] < SAME_RAD
 
 
-def agreement(reading: Candidate, looks: Sequence[Candidate]) -> float:
-    """Probability of a reading among all that ``looks`` at the part name, each look a witness of its own.
+def agreement(reading: Reading, looks: Sequence[Sequence[Reading]]) -> float:
+    """Probability of a reading among all that any of the looks at the part names, each look a witness of its own.
 
-    The score of an estimate is the probability that it is right; what is left of it goes to any other reading. The
-    log-probabilities of a reading add over the looks.
+    The log-probabilities of a reading add over the looks. A look that does not name it leaves it what its own readings
+    leave over.
     """
-    named: list[Candidate] = [reading]
-    for look in looks:
-        if not any(same_reading(look, other) for other in named):
-            named.append(look)
+    named = [reading]
+    for other in (other for look in looks for other in look):
+        if not any(same_reading(other, known) for known in named):
+            named.append(other)
     logs = np.array([sum(_log_probability(look, other) for look in looks) for other in named])
     weights = np.exp(logs - logs.max())
     return float(weights[0] / weights.sum())
 
 
-def _log_probability(look: Candidate, reading: Candidate) -> float:
-    score = look.estimate.score
-    return float(np.log(np.clip(score if same_reading(look, reading) else 1.0 - score, FLOOR, 1.0 - FLOOR)))
+def _log_probability(look: Sequence[Reading], reading: Reading) -> float:
+    left = 1.0 - sum(other.probability for other in look)
+    probability = next((other.probability for other in look if same_reading(other, reading)), left)
+    return float(np.log(np.clip(probability, FLOOR, 1.0 - FLOOR)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,8 @@ class PickConfig:
     """Who says where the parts are: the trained networks, or ground truth."""
     second_looks: tuple[LookKind, ...] = ("exposure", "park", "nudge")
     """Other looks at what the estimator is unsure of, in this order; give the option without a value for none."""
+    exposure: float = 1.0
+    """The camera's usual exposure time against a good one: above 1 what shines is too bright to be read."""
     weights: Path | None = None
     """Folder of trained weights; the ones that come with Tagcell when left out."""
     out: Path = Path("runs/pick")
@@ -45,6 +48,8 @@ class PickConfig:
             value = getattr(self, name)
             if not 1 <= value <= most:
                 raise ValueError(f"{name.replace('_', '-')} is {value}; it must be between 1 and {most}")
+        if not (math.isfinite(self.exposure) and self.exposure > 0):
+            raise ValueError(f"exposure is {self.exposure}; it must be positive")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; it must not be negative")
         known = part_names(self.parts_dir)

@@ -103,5 +103,8 @@ class Camera(Protocol):
     """A camera that looks at the board."""
 
     def capture(self, exposure: float = 1.0) -> Frame:
-        """A fresh frame, exposed after the call for ``exposure`` times the camera's usual exposure time."""
+        """A fresh frame, exposed after the call for ``exposure`` times the camera's usual exposure time.
+
+        Raises TwinError when none has come by the camera's own deadline.
+        """
         ...

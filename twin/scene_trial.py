@@ -18,6 +18,7 @@ from scenes.camera import camera_pose, set_camera_pose
 from scenes.classic import ClassicRenderer
 from scenes.gl import mujoco
 from scenes.placement import settle_parts
+from scenes.sensor import SensorConfig
 from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.assessment import Beliefs, assess, centre, match, pose_error
 from twin.attempts import Attempt
@@ -90,7 +91,10 @@ class SceneTrial:
         width, height = cell.intrinsics.width, cell.intrinsics.height
         blind = estimator is None and not config.pictures  # nobody looks at what the oracle's camera sees
         self._renderer = None if blind else ClassicRenderer(self._model, max_width=width, max_height=height)
-        self._camera = SimCamera(self._model, self._data, self._renderer, rng=np.random.default_rng(noise))
+        sensor = SensorConfig(exposure=config.exposure)
+        self._camera = SimCamera(
+            self._model, self._data, self._renderer, rng=np.random.default_rng(noise), sensor=sensor
+        )
         self._estimator = estimator or OracleEstimator(self._model, self._data, self._parts, cell)
         self._referee = Referee(self._model, self._data, cell, self._parts)
         self._beliefs = [Beliefs() for _ in self._parts]

@@ -145,7 +145,7 @@ class SecondLooks:
     def _weigh(self, doubt: Doubt, view: View, candidate: Candidate) -> Candidate:
         """The candidate, declined when the other looks at the place make its reading less than probable."""
         doubt.centre, doubt.seen[view] = candidate.centre, candidate
-        probability = agreement(candidate, list(doubt.seen.values()))
+        probability = agreement(candidate.readings[0], [seen.readings for seen in doubt.seen.values()])
         if candidate.problem is None and probability < self.config.agree_above:
             note = f"looks disagree: probability {probability:.2f} over {len(doubt.seen)} looks"
             candidate = replace(candidate, problem=("declined", note))

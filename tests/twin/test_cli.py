@@ -37,6 +37,19 @@ def test_counts_outside_their_range_are_refused(capsys, flag, value):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        ("--exposure -1", "exposure is -1.0; it must be positive"),
+        ("--second-looks nudge nudge", "second-looks are nudge, nudge; name each kind once"),
+        ("--second-looks stare", "stare"),
+    ],
+)
+def test_looks_that_make_no_sense_are_refused(capsys, arguments, said):
+    code, text = fails(capsys, "pick", *arguments.split())
+    assert code == 2 and said in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
         ("part stable-poses main --drops 0", "drops 0"),
         ("part stable-poses main --seed -1", "seed -1"),
         ("render --seed -1", "seed -1"),

@@ -29,7 +29,7 @@ def lying(x, y, yaw=0.0):
     T = CELL.T_world_board @ planar(x, y, yaw) @ PART.stable_poses[0].T_table_part
     estimate = PartEstimate(part="main", T_cam_part=T, stable_pose=0, score=0.5, verdict=AMBIGUOUS)
     placed = PlacedPart(part=PART, T_base_part=T)
-    return Candidate(estimate=estimate, placed=placed, problem=("declined", AMBIGUOUS))
+    return Candidate(estimate=estimate, placed=placed, readings=(), problem=("declined", AMBIGUOUS))
 
 
 def plan(target, others=(), solve=lambda T: np.zeros(6), **config):

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from twin.events import LookedAgain
 from twin.scorecard import (
     FAILURES,
     PartResult,
@@ -58,6 +59,19 @@ def test_a_part_that_was_skipped_counts_against_the_rate():
     assert card["failures"]["declined"] == card["failures"]["detection"] == 1
     assert set(card["failures"]) == set(FAILURES)
     assert card["picks_per_hour"] == pytest.approx(400.0)
+
+
+def test_other_looks_are_counted_by_kind():
+    exposure = LookedAgain(kind="exposure", unsure=2, accepted=1, seconds=1.1)
+    nudge = LookedAgain(kind="nudge", unsure=1, accepted=0, seconds=5.0)
+    scenes = [
+        SceneResult(scene=0, parts=(), cycle_s=(), retries=0, looked_again=(exposure, nudge)),
+        SceneResult(scene=1, parts=(), cycle_s=(), retries=0, looked_again=(exposure,)),
+    ]
+    assert build_scorecard(scenes, config={})["second_looks"] == {
+        "exposure": {"looks": 2, "accepted": 2, "seconds": 2.2},
+        "nudge": {"looks": 1, "accepted": 0, "seconds": 5.0},
+    }
 
 
 def test_every_failed_part_has_one_cause():

@@ -7,8 +7,10 @@ import pytest
 from fake_cell import BOARD, PLACES, World
 
 from cad.parts import planar
-from perception.estimates import ACCEPTED, AMBIGUOUS, NOT_A_PART, PartEstimate
-from twin.candidates import Candidate
+from cad.spatial import inverse
+from perception.estimates import ACCEPTED, AMBIGUOUS, NOT_A_PART, PartEstimate, PoseAlternative
+from twin.attempts import Calibration, ControllerConfig
+from twin.candidates import Candidate, Reading, bring_down
 from twin.events import Looked, LookedAgain, NudgeFinished, NudgeStarted
 from twin.evidence import agreement, same_reading
 from twin.grasp_choice import PlacedPart
@@ -23,7 +25,16 @@ def candidate(part, x=0.0, yaw=0.0, score=0.6, verdict=AMBIGUOUS):
     T = BOARD @ planar(x, 0.0, yaw) @ part.stable_poses[0].T_table_part
     estimate = PartEstimate(part=part.name, T_cam_part=T, stable_pose=0, score=score, verdict=verdict)
     problem = None if verdict == ACCEPTED else ("declined", verdict)
-    return Candidate(estimate=estimate, placed=PlacedPart(part=part, T_base_part=T), problem=problem)
+    return Candidate(
+        estimate=estimate,
+        placed=PlacedPart(part=part, T_base_part=T),
+        readings=(Reading(part=part, stable_pose=0, T_base_part=T, probability=score),),
+        problem=problem,
+    )
+
+
+def reading(part, yaw=0.0, probability=0.7):
+    return candidate(part, yaw=yaw, score=probability).readings[0]
 
 
 def push(target, others=(), free_m=0.01):
@@ -93,13 +104,38 @@ def test_a_push_that_is_refused_is_not_made_and_the_one_with_most_room_comes_fir
 
 
 def test_log_probabilities_of_a_reading_add_over_looks(brick):
-    there, turned = candidate(brick, score=0.7), candidate(brick, yaw=1.0, score=0.7)
-    assert same_reading(there, candidate(brick, yaw=0.1)) and not same_reading(there, turned)
-    assert agreement(there, [there]) == 1.0  # nothing speaks for anything else
-    assert agreement(there, [there, turned]) == pytest.approx(0.5)
-    assert agreement(there, [there, there, turned]) == pytest.approx(0.7)
-    sure = candidate(brick, score=0.97, verdict=ACCEPTED)
-    assert agreement(sure, [sure, turned]) == pytest.approx(0.97 * 0.3 / (0.97 * 0.3 + 0.03 * 0.7))
+    there, turned = reading(brick), reading(brick, yaw=1.0)
+    assert same_reading(there, reading(brick, yaw=0.1)) and not same_reading(there, turned)
+    assert agreement(there, [[there]]) == 1.0  # nothing speaks for anything else
+    assert agreement(there, [[there], [turned]]) == pytest.approx(0.5)
+    assert agreement(there, [[there], [there], [turned]]) == pytest.approx(0.7)
+    sure = reading(brick, probability=0.97)
+    assert agreement(sure, [[sure], [turned]]) == pytest.approx(0.97 * 0.3 / (0.97 * 0.3 + 0.03 * 0.7))
+    both = [reading(brick, probability=0.6), reading(brick, yaw=1.0, probability=0.4)]
+    assert agreement(there, [both]) == pytest.approx(0.6)
+    assert agreement(there, [both, both]) == pytest.approx(0.36 / (0.36 + 0.16))
+
+
+def test_alternatives_of_an_estimate_are_readings_on_the_board(brick):
+    T_cam_part, T_base_cam = planar(0.01, 0.0, 0.5), planar(0.4, 0.0, 1.0)
+    T_base_part = BOARD @ brick.stable_poses[0].T_table_part
+    T_cam = inverse(T_base_cam) @ T_base_part
+    others = (("brick", T_cam @ T_cam_part, 0.25), ("unknown", T_cam, 0.05))
+    estimate = PartEstimate(
+        part="brick",
+        T_cam_part=T_cam,
+        stable_pose=0,
+        score=0.3,
+        alternatives=tuple(
+            PoseAlternative(part=name, stable_pose=0, T_cam_part=T, probability=p)
+            for name, T, p in (("brick", T_cam, 0.7), *others)
+        ),
+    )
+    calibration = Calibration(T_base_board=BOARD, T_base_nests={}, q_park=np.zeros(6), board_half_m=(0.1, 0.1))
+    seen = bring_down(estimate, {"brick": brick}, T_base_cam, calibration, ControllerConfig())
+    assert [r.probability for r in seen.readings] == [0.7, 0.25]
+    np.testing.assert_allclose(seen.readings[0].T_base_part, seen.placed.T_base_part, atol=1e-12)
+    np.testing.assert_allclose(seen.readings[1].T_base_part, T_base_part @ T_cam_part, atol=1e-12)
 
 
 def test_an_accepted_estimate_that_other_looks_contradict_is_declined(brick):

@@ -5,9 +5,10 @@ from cad.parts import load_part, planar
 from cad.spatial import Intrinsics, inverse, rotation_x
 from perception.estimates import Frame
 from scenes.camera import camera_pose
+from scenes.errors import SceneError
 from scenes.gl import mujoco
 from scenes.render import Rendering
-from scenes.sensor import SensorConfig
+from scenes.sensor import SensorConfig, expose
 from scenes.workcell import CellConfig, build_workcell, set_parts
 from twin.oracle import OracleEstimator
 from twin.sim_camera import SimCamera
@@ -62,10 +63,41 @@ def test_noise_comes_from_the_generator(cell):
     assert (frame(1, sensor=quiet) == 120).all()
 
 
-def test_negative_latency_is_refused(cell):
+def test_exposure_multiplies_the_cameras_own_and_takes_time_to_change(cell):
     model, _ = cell
-    with pytest.raises(ValueError, match=r"latency_s -1"):
-        SimCamera(model, mujoco.MjData(model), GreyRenderer(), rng=np.random.default_rng(0), latency_s=-1.0)
+    data, quiet = mujoco.MjData(model), SensorConfig(blur_px=0.0, shot_noise=0.0, read_noise=0.0, exposure=0.5)
+    camera = SimCamera(
+        model,
+        data,
+        GreyRenderer(),
+        rng=np.random.default_rng(0),
+        intrinsics=SMALL,
+        sensor=quiet,
+        latency_s=0.05,
+        change_s=0.02,
+    )
+    frames = [camera.capture(), camera.capture(3.0), camera.capture(3.0), camera.capture()]
+    assert [int(f.image[0, 0, 0]) for f in frames] == [60, 180, 180, 60]
+    assert [f.time_s for f in frames] == pytest.approx([0.0, 0.07, 0.12, 0.19])
+    with pytest.raises(SceneError, match=r"exposure -0\.5"):
+        camera.capture(-1.0)
+
+
+def test_the_usual_exposure_leaves_every_byte_as_it_is(cell):
+    model, _ = cell
+    plain, sensor = (
+        SimCamera(model, mujoco.MjData(model), GreyRenderer(), rng=np.random.default_rng(5), intrinsics=SMALL),
+        SensorConfig(),
+    )
+    ideal = np.full((SMALL.height, SMALL.width, 3), 120, np.uint8)
+    np.testing.assert_array_equal(plain.capture().image, expose(ideal, sensor, np.random.default_rng(5)))
+
+
+def test_negative_times_are_refused(cell):
+    model, _ = cell
+    for name in ("latency_s", "change_s"):
+        with pytest.raises(ValueError, match=f"{name} -1"):
+            SimCamera(model, mujoco.MjData(model), GreyRenderer(), rng=np.random.default_rng(0), **{name: -1.0})
 
 
 def test_the_oracle_tells_the_truth_about_what_lies_on_the_board(cell):
