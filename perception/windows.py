@@ -47,26 +47,30 @@ def filled(instances: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class Windows:
-    """The training windows as examples, their instances without holes unless ``holes`` are asked for."""
+    """The training windows as examples, their instances without holes unless ``holes`` are asked for.
+
+    Only what examples need of the set is kept, which is gigabytes.
+    """
 
     def __init__(self, data: WindowSet, parts: Sequence[Part], *, holes: bool = False) -> None:
-        self.data = data
+        self.images = data.images
         self.instances = data.instance_map if holes else np.stack([filled(each) for each in data.instance_map])
-        self.labels = data.labels(parts)
+        labels = data.labels(parts)
+        self.body_px, self.part_index = labels.body_px, labels.part_index
+        self.rows = [rows[np.argsort(data.instance[rows])] for rows in data.instances_of]
 
     def __len__(self) -> int:
-        return len(self.data)
+        return len(self.images)
 
     def __getitem__(self, index: int) -> Window:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
-        rows = self.data.instances_of[index]
-        order = rows[np.argsort(self.data.instance[rows])]
+        rows = self.rows[index]
         return Window(
-            image=self.data.images[index],
+            image=self.images[index],
             instances=self.instances[index],
-            centres=self.labels.body_px[order],
-            classes=self.labels.part_index[order],
+            centres=self.body_px[rows],
+            classes=self.part_index[rows],
         )
 
 
