@@ -24,6 +24,7 @@ from cad.parts import Part, hash_file
 from scenes.bop import write_camera, write_models
 from scenes.dataset_config import DatasetConfig
 from scenes.errors import SceneError
+from scenes.path_traced import GROUND_SAMPLES, LARGE_PX, REFLECTANCE_SAMPLES, SAMPLES
 from scenes.rests import RestPool
 from scenes.shards import clear_partial, images_in, shard_digest, shard_path
 from scenes.targets import TARGETS, targets_in
@@ -48,6 +49,8 @@ def identity(config: DatasetConfig) -> dict[str, Any]:
     content |= {"view": asdict(config.view_ranges)}
     content |= {"size": config.pixels, "downscale": config.scale_down, "shard": config.shard_size}
     content["parts"] = {part.name: _part_identity(part) for part in config.load_parts()}
+    if config.domain == "mitsuba" and config.pixels[0] * config.pixels[1] > LARGE_PX:
+        content["samples"] = {"near_things": SAMPLES, "ground": GROUND_SAMPLES, "reflectance": REFLECTANCE_SAMPLES}
     libraries = (*LIBRARIES, "mitsuba") if config.domain == "mitsuba" else LIBRARIES
     content["libraries"] = {name: _version(name) for name in libraries}
     return json.loads(json.dumps(content))

@@ -5,6 +5,7 @@ Light, materials and exposure are those of ``scenes.scene_export``; see ``scenes
 
 from __future__ import annotations
 
+import math
 import zlib
 from importlib import import_module
 from types import ModuleType
@@ -17,8 +18,9 @@ from cad.spatial import Intrinsics
 from scenes.camera import CAMERA, camera_pose
 from scenes.errors import SceneError
 from scenes.gl import mujoco
+from scenes.ground_light import boxes, near_things, smooth_light
 from scenes.path_view import MM, View, check_square
-from scenes.photoreal import load_mitsuba, mitsuba_problem
+from scenes.photoreal import draws_pixels, load_mitsuba, mitsuba_problem
 from scenes.render import ALL, Rendering, What, check_window
 from scenes.scene_export import (
     DrawnGeom,
@@ -37,8 +39,14 @@ MAX_DEPTH = 6
 GROUPS = 8
 STRIDE = 1_000_003
 SPECK_FACTOR, SPECK_LEVEL = 1.5, 0.05
+LARGE_PX = 4_000_000
+"""A window of more pixels has ``samples`` only round the things in it."""
+GROUND_SAMPLES, REFLECTANCE_SAMPLES = 4, 8
+"""A pixel of a large window elsewhere."""
 SAMPLES_AT_ONCE = 1 << 24
 """Larger windows are drawn in bands of rows, which bounds the memory that a render takes."""
+PIXEL_SAMPLES_AT_ONCE = 1 << 21
+"""The same for single pixels, of which samples are kept."""
 SCENE = {"type": "scene", "embree_use_robust_intersections": True}
 """Rays do not slip through between two triangles."""
 SMOOTHEST = 0.03
@@ -55,6 +63,9 @@ class MitsubaRenderer:
     scene through the same window gives the same bytes, by any number of threads, and another scene other noise; so do
     Mitsuba's two variants, and may processors of other kinds. All surfaces cast shadows. Lamps shine in all directions
     and are seen in reflections only, never by the camera; what no geom covers is black.
+
+    In windows of more than ``LARGE_PX`` pixels only what can move, and its surroundings with its shadows, gets
+    ``samples``; light on what cannot move is fitted to fewer (see ``scenes.ground_light``).
     """
 
     def __init__(
@@ -69,6 +80,7 @@ class MitsubaRenderer:
         self._kept: dict[Any, Any] = {}
         self._colours = self._mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
         self._labels = self._mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
+        self._reflectance = self._mi.load_dict({"type": "aov", "aovs": "reflectance:albedo"})
 
     def render(
         self,
@@ -92,7 +104,8 @@ class MitsubaRenderer:
         rgb = instances = depth = None
         if "rgb" in what:
             lit = self._mi.load_dict({**SCENE, **shapes, **self._lights(scene, view, used)})
-            rgb = self._draw_colours(lit, view)
+            small = intrinsics.width * intrinsics.height <= LARGE_PX
+            rgb = self._draw_colours(lit, view) if small else self._draw_large(lit, view, scene)
         if "instances" in what or "depth" in what:
             bare = self._mi.load_dict({**SCENE, **shapes})
             drawn = self._draw(bare, self._labels, view, 1, 0)
@@ -116,19 +129,60 @@ class MitsubaRenderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _draw_colours(self, scene: Any, view: View) -> NDArray[np.float32]:
-        """Grey levels (H, W, 3): the mean of several groups of samples, none of which may be far above their median.
-
-        A path that finds a lamp by way of a mirror is rare and bright; alone in its pixel it would be a white speck.
-        """
+    def _draw_large(self, scene: Any, view: View, drawn: SceneDescription) -> NDArray[np.float32]:
+        """Grey levels (H, W, 3): few samples of the ground, as many as asked for near things."""
         seed = zlib.crc32(view.signature(self._seed))
-        groups = max(1, min(GROUPS, self._samples // GROUPS))
-        drawn = [
-            self._draw(scene, self._colours, view, self._samples // groups, seed + STRIDE * k) for k in range(groups)
-        ]
-        levels = np.stack(drawn)
-        limit = SPECK_FACTOR * np.median(levels, axis=0) + SPECK_LEVEL
-        return 255 * np.minimum(levels, limit).mean(axis=0)
+        noisy = self._draw(scene, self._colours, view, min(GROUND_SAMPLES, self._samples), seed)
+        reflectance = self._draw(scene, self._reflectance, view, REFLECTANCE_SAMPLES, seed + STRIDE)
+        levels = 255 * smooth_light(noisy, reflectance)
+        model = self._model
+        bodies = [int(model.geom_bodyid[geom.geom]) for geom in drawn.geoms]
+        moves = [model.body_weldid[body] != 0 or model.body_mocapid[body] >= 0 for body in bodies]
+        things = [geom for geom, moving in zip(drawn.geoms, moves, strict=True) if moving]
+        near = near_things(things, drawn.lamps, view.intrinsics, view.T_world_cam)
+        if draws_pixels(self._mi):
+            levels[near] = self._draw_pixels(scene, view, np.argwhere(near), seed + 2 * STRIDE)
+        else:
+            for x, y, width, height in boxes(near):
+                part = view.through(view.intrinsics.crop(x, y, width, height))
+                levels[y : y + height, x : x + width] = self._draw_colours(scene, part)
+        return levels
+
+    def _draw_pixels(self, scene: Any, view: View, pixels: NDArray[np.int64], seed: int) -> NDArray[np.float32]:
+        """Grey levels (N, 3) of some pixels (N, 2), row and column, as ``_draw_colours`` draws whole windows.
+
+        They are drawn in portions of one size, which Mitsuba compiles once.
+        """
+        mi, dr = self._mi, import_module("drjit")
+        description = view.sensor(mi, view.intrinsics, self._samples)
+        sensor, sampler = mi.load_dict(description), mi.load_dict(description["sampler"])
+        samples = int(sampler.sample_count())  # rounded up where it cannot be spread well
+        sampler.set_samples_per_wavefront(samples)
+        groups = math.gcd(samples, self._groups)
+        portion = max(1, PIXEL_SAMPLES_AT_ONCE // samples)
+        owner = dr.arange(mi.UInt32, portion * samples) // samples
+        size = mi.Point2f(view.intrinsics.width, view.intrinsics.height)
+        levels = np.empty((len(pixels), 3), np.float32)
+        for start in range(0, len(pixels), portion):
+            some = pixels[start : start + portion]
+            rows, columns = (mi.Float(axis) for axis in np.resize(some, (portion, 2)).T.astype(np.float32))
+            sampler.seed((seed + start) % 2**32, portion * samples)
+            corner = mi.Point2f(dr.gather(mi.Float, columns, owner), dr.gather(mi.Float, rows, owner))
+            ray, weight = sensor.sample_ray(0.0, 0.0, (corner + sampler.next_2d()) / size, mi.Point2f(0.5))
+            seen, _, _ = self._colours.sample(scene, sampler, mi.RayDifferential3f(ray))
+            drawn = np.array(seen * weight, np.float32).reshape(3, portion, groups, -1).mean(axis=-1)
+            levels[start : start + portion] = _levels(drawn.T)[: len(some)]
+        return levels
+
+    def _draw_colours(self, scene: Any, view: View) -> NDArray[np.float32]:
+        """Grey levels (H, W, 3) from several groups of samples."""
+        seed, each = zlib.crc32(view.signature(self._seed)), self._samples // self._groups
+        drawn = [self._draw(scene, self._colours, view, each, seed + STRIDE * k) for k in range(self._groups)]
+        return _levels(np.stack(drawn))
+
+    @property
+    def _groups(self) -> int:
+        return max(1, min(GROUPS, self._samples // GROUPS))
 
     def _draw(self, scene: Any, integrator: Any, view: View, samples: int, seed: int) -> NDArray[np.float32]:
         """What an integrator makes of a scene, (H, W, channels), drawn in bands that fit into memory."""
@@ -146,7 +200,7 @@ class MitsubaRenderer:
     def _geom_order(self, scene: Any) -> NDArray[np.int64]:
         """Index by a shape's number in an image; gives 1 + the place of its geom among the drawn ones, 0 for none."""
         shapes = scene.shapes()
-        if self._mi.variant().startswith("scalar"):
+        if not draws_pixels(self._mi):
             numbers = np.arange(1, len(shapes) + 1)
         else:
             reinterpret = import_module("drjit").reinterpret_array
@@ -210,6 +264,15 @@ class MitsubaRenderer:
         upright = self._mi.ScalarTransform4f().rotate([1, 0, 0], 90).rotate([0, 1, 0], 180)
         panorama = self._mi.Bitmap(environment_panorama(self._model, texture))
         return self._mi.load_dict({"type": "envmap", "bitmap": panorama, "scale": radiance, "to_world": upright})
+
+
+def _levels(groups: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Grey levels (..., 3): the mean of groups of samples (G, ..., 3), none of which may be far above their median.
+
+    A path that finds a lamp by way of a mirror is rare and bright; alone in its pixel it would be a white speck.
+    """
+    limit = SPECK_FACTOR * np.median(groups, axis=0) + SPECK_LEVEL
+    return 255 * np.minimum(groups, limit).mean(axis=0)
 
 
 def _lamp(mi: ModuleType, lamp: DrawnLamp, view: View) -> dict[str, Any]:

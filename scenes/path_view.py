@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from types import ModuleType
 from typing import Any
 
@@ -21,7 +22,8 @@ CAM_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 class View:
     """A window of a camera, and the frame that Mitsuba works in: millimetres from where the window looks.
 
-    ``parts`` (3,) is the middle of the parts in the world, or of everything where there are none.
+    ``T_world_cam`` (4, 4) is the camera's pose, ``parts`` (3,) the middle of the parts in the world, or of everything
+    where there are none.
 
     Mitsuba leaves a gap of 1e-4 of a point's coordinates between a surface and the rays that start there; so far from
     the origin or in metres, small parts would lose their shadows.
@@ -29,7 +31,7 @@ class View:
 
     def __init__(self, intrinsics: Intrinsics, T_world_cam: Array, scene: SceneDescription) -> None:
         self.intrinsics = intrinsics
-        self._T_world_cam = T_world_cam
+        self.T_world_cam = T_world_cam
         middle = [(intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2]
         ray = T_world_cam[:3, :3] @ intrinsics.rays(middle)
         parts = [geom for geom in scene.geoms if geom.instance >= 0] or scene.geoms
@@ -37,11 +39,17 @@ class View:
         self._origin = T_world_cam[:3, 3] + ray * ((self.parts - T_world_cam[:3, 3]) @ T_world_cam[:3, 2])
         self._moved = np.concatenate([geom.T_world_geom for geom in scene.geoms]) if scene.geoms else np.zeros((4, 4))
 
+    def through(self, window: Intrinsics) -> View:
+        """The same scene and frame through another window of the camera."""
+        other = copy(self)
+        other.intrinsics = window
+        return other
+
     def signature(self, seed: int) -> bytes:
         """Differs where the seed, the window, the camera or anything's pose differs."""
         i = self.intrinsics
         head = [seed, i.width, i.height, i.fx, i.cx, i.cy]
-        return np.concatenate([head, self._T_world_cam.ravel(), self._moved.ravel()]).tobytes()
+        return np.concatenate([head, self.T_world_cam.ravel(), self._moved.ravel()]).tobytes()
 
     def local(self, points: Array) -> Array:
         """World points (..., 3) in metres to Mitsuba's frame."""
@@ -49,12 +57,12 @@ class View:
 
     def depth_m(self, local: NDArray[np.float32]) -> Array:
         """Metres along the camera's z of points (..., 3) in Mitsuba's frame."""
-        return (local.astype(np.float64) / MM + self._origin - self._T_world_cam[:3, 3]) @ self._T_world_cam[:3, 2]
+        return (local.astype(np.float64) / MM + self._origin - self.T_world_cam[:3, 3]) @ self.T_world_cam[:3, 2]
 
     def sensor(self, mi: ModuleType, window: Intrinsics, samples: int) -> dict[str, Any]:
         """The camera through ``window``; one sample is that of the pixel's centre."""
         width, height = window.width, window.height
-        T_local_cam = self._T_world_cam @ CAM_FROM_MITSUBA
+        T_local_cam = self.T_world_cam @ CAM_FROM_MITSUBA
         T_local_cam[:3, 3] = self.local(T_local_cam[:3, 3])
         return {
             "type": "perspective",

@@ -59,3 +59,8 @@ def load_mitsuba() -> ModuleType:
     except ImportError:
         mitsuba.set_variant("scalar_rgb")
     return mitsuba
+
+
+def draws_pixels(mitsuba: ModuleType) -> bool:
+    """Whether its variant works on many rays at once, and so draws pixels from all over an image in one go."""
+    return not mitsuba.variant().startswith("scalar")

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -16,6 +17,7 @@ from scenes.camera import add_camera
 from scenes.classic import ClassicRenderer
 from scenes.errors import SceneError
 from scenes.gl import mujoco
+from scenes.ground_light import near_things
 from scenes.look import add_material, add_mesh, add_raw_mesh, add_texture, add_visual
 from scenes.path_traced import MitsubaRenderer, mitsuba_problem
 from scenes.photoreal import LLVM_VARIABLE, usable_llvm
@@ -204,6 +206,46 @@ def test_windows_of_many_bands_have_no_seams(lit_ball, renderer, monkeypatch):
     np.testing.assert_allclose(banded.depth_m, whole.depth_m, atol=1e-6)
     difference = (banded.rgb - whole.rgb).mean(axis=(1, 2))
     assert np.abs(difference).max() < 8 and abs(difference.mean()) < 2
+
+
+def drawn_with_few_samples(lit_ball, monkeypatch, size=(200, 80)):
+    """A window with the ball left of its middle by many samples and by few, and what of it is near the ball."""
+    model, data = lit_ball
+    window = BASLER.crop(2736 - 80, 1824 - 40, *size)
+    near = []
+
+    def noted(*arguments):
+        near.append(near_things(*arguments))
+        return near[-1]
+
+    monkeypatch.setattr("scenes.path_traced.near_things", noted)
+    with MitsubaRenderer(model, max_width=size[0], max_height=size[1]) as renderer:
+        every = renderer.render(data, window, ("rgb",)).rgb
+        monkeypatch.setattr("scenes.path_traced.LARGE_PX", size[0] * size[1] - 1)
+        few, again = (renderer.render(data, window, ("rgb",)).rgb for _ in range(2))
+    np.testing.assert_array_equal(few, again)
+    return every, few, near[0]
+
+
+def test_few_samples_of_the_ground_look_like_many(lit_ball, monkeypatch):
+    """Neither the level nor a seam tells where the surroundings of the ball end, and the same bytes come again."""
+    every, few, near = drawn_with_few_samples(lit_ball, monkeypatch)
+    difference = few - every
+    assert 0.2 < near.mean() < 0.8
+    assert abs(difference[near].mean()) < 0.5 and abs(difference[~near].mean()) < 0.5
+    assert np.abs(difference[~near]).mean() < 3
+    ring = np.ones((9, 9), np.uint8)
+    outside = cv2.dilate(near.astype(np.uint8), ring).astype(bool) & ~near
+    inside = near & ~cv2.erode(near.astype(np.uint8), ring).astype(bool)
+    assert abs(difference[outside].mean() - difference[inside].mean()) < 1.5
+
+
+def test_pieces_of_an_image_are_drawn_one_by_one_where_pixels_cannot_be(lit_ball, monkeypatch):
+    _, few, near = drawn_with_few_samples(lit_ball, monkeypatch)
+    monkeypatch.setattr("scenes.path_traced.draws_pixels", lambda mitsuba: False)
+    _, other, _ = drawn_with_few_samples(lit_ball, monkeypatch)
+    np.testing.assert_allclose(other[near].mean(), few[near].mean(), rtol=0.01)
+    assert np.abs(other - few)[near].mean() < 5
 
 
 OTHER_VARIANT = """
