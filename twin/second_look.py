@@ -77,6 +77,7 @@ class SecondLooks:
         }
         self._views = [view for kind in config.looks for view in views[kind]]
         self._doubts: list[Doubt] = []
+        self._shown: dict[View, list[Candidate]] = {}
         self._looks, self._seconds = 0, 0.0
         self.accepted = 0
 
@@ -91,6 +92,7 @@ class SecondLooks:
         ``accepted`` then says how many doubtful places it settled so that there is something to pick. A usual look
         shows what there is: a doubt about a place where it finds nothing is dropped.
         """
+        self._shown[view] = list(candidates)
         found: dict[int, Doubt] = {}
         out = []
         self.accepted = 0
@@ -114,8 +116,8 @@ class SecondLooks:
     ) -> View | Nudge | None:
         """The look to take after one of ``view`` that showed nothing to pick; None when there is none to take.
 
-        ``plan`` makes a push of a candidate past the others, or says why there is none. Pushes are planned on usual
-        looks only: where other looks have come in between, a usual one comes first.
+        ``plan`` makes a push of a candidate past all else that any view has shown, or says why there is none. Pushes
+        are planned on usual looks only: where other looks have come in between, a usual one comes first.
         """
         doubts = [doubt for doubt in self._doubts if doubt.open]
         config = self.config
@@ -134,11 +136,13 @@ class SecondLooks:
 
     def pushed(self, nudge: Nudge) -> None:
         """What was nudged lies elsewhere now: what was seen of it no longer counts."""
+        self._vacate(nudge.centre)
         if doubt := self._at(nudge.centre):
             doubt.centre, doubt.nudges, doubt.seen = nudge.centre_after, doubt.nudges + 1, {}
 
     def forget(self, centre: Array) -> None:
         """Drop the doubt about a place (2,) that the hand has been at."""
+        self._vacate(centre)
         doubt = self._at(centre)
         self._doubts = [other for other in self._doubts if other is not doubt]
 
@@ -161,10 +165,19 @@ class SecondLooks:
             doubt = self._at(candidate.centre)
             if doubt is None or not doubt.open or doubt.nudges >= self.config.nudges:
                 continue
-            nudge = plan(candidate, [other for other in candidates if other is not candidate])
+            seen = [other for shown in self._shown.values() for other in shown]
+            nudge = plan(candidate, [other for other in seen if not self._near(other.centre, candidate.centre)])
             if isinstance(nudge, Nudge):
                 nudges.append((doubt.nudges, -nudge.free_m, nudge))
         return min(nudges, key=lambda n: n[:2])[2] if nudges else None
+
+    def _vacate(self, centre: Array) -> None:
+        """Nothing that was shown at a place is there any more."""
+        for view, shown in self._shown.items():
+            self._shown[view] = [other for other in shown if not self._near(other.centre, centre)]
+
+    def _near(self, a: Array, b: Array) -> bool:
+        return float(np.linalg.norm(a - b)) < self.config.same_place_m
 
     def _at(self, centre: Array) -> Doubt | None:
         near = [(float(np.linalg.norm(doubt.centre - centre)), doubt) for doubt in self._doubts]
