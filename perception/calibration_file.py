@@ -206,7 +206,7 @@ def _parsed(text: str) -> CellCalibration:
     unknown = sorted(set(content) - {"format", "version", *FIELDS})
     if unknown:
         raise CalibrationError(f"it has the unknown field {', '.join(unknown)}; fields are {', '.join(FIELDS)}")
-    if "intrinsics" not in content:
+    if content.get("intrinsics") is None:
         raise CalibrationError(f"it has no intrinsics: {', '.join(f'{name}_px' for name in PIXELS)}")
     values = {name: content[name] for name in FIELDS if content.get(name) is not None}
     try:

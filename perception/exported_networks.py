@@ -13,6 +13,8 @@ from perception.export import Exportable, Inputs
 from perception.faces import FaceTable
 from perception.posenets import PoseNets
 from perception.pvnet import PVNet
+from perception.pvnet_baseline import PVNET_WEIGHTS, load_pvnets
+from perception.pvnet_baseline_net import Pvnets
 from perception.segmentation import NETWORK_STRIDE, SegmentationNet, Segmenter
 from perception.verifier import RECTIFIED
 
@@ -51,14 +53,39 @@ class KeypointVotes(nn.Module):
         return mask, offset, log_scale
 
 
+class PartVectors(nn.Module):
+    """The baseline's vectors of all cells of a crop to the keypoints of each part."""
+
+    def __init__(self, nets: Pvnets) -> None:
+        super().__init__()
+        self.nets = nets
+
+    def forward(self, crop: Tensor) -> tuple[Tensor, ...]:
+        """Mask logits (B, 64, 64) and vectors (B, 4096, K, 2) of each part, in the order of the parts."""
+        maps = self.nets.encoder(crop)
+        out: list[Tensor] = []
+        for part in self.nets.decoders:
+            decoder = self.nets.decoder(part)
+            features, mask = decoder(maps)
+            out += [mask, decoder.vectors(features.flatten(2).transpose(1, 2))]
+        return tuple(out)
+
+
 def exportable_networks(weights_dir: Path, parts_dir: Path | None = None) -> list[Exportable]:
-    """The networks kept in ``weights_dir``; raises PerceptionError when one is missing or a part has changed."""
+    """The networks kept in ``weights_dir``, the published baseline's where there are weights of it.
+
+    Raises PerceptionError when one of the others is missing or a part has changed.
+    """
     segmenter = Segmenter.load(weights_dir, parts_dir)
     nets = PoseNets.load(weights_dir, parts_dir)
-    return [
+    found = [
         segmentation_network(segmenter.net.cpu(), list(segmenter.part_names), weights_dir),
         *crop_networks(nets, weights_dir),
     ]
+    baseline = weights_dir / PVNET_WEIGHTS
+    if baseline.exists():
+        found.append(baseline_network(load_pvnets(baseline, parts_dir)[0], baseline))
+    return found
 
 
 def segmentation_network(net: SegmentationNet, part_names: list[str], weights_dir: Path) -> Exportable:
@@ -137,6 +164,26 @@ def crop_networks(nets: PoseNets, weights_dir: Path) -> list[Exportable]:
             about=about,
         ),
     ]
+
+
+def baseline_network(nets: Pvnets, weights: Path) -> Exportable:
+    """The published baseline: one file for all parts."""
+    crops = [_noise(crop=(n, CHANNELS, CROP, CROP)) for n in (2, 1, 3)]
+    outputs = {}
+    for part in nets.decoders:
+        outputs[f"{part}_mask"] = "(batch, 64, 64) logits of the part; a cell is 2 x 2 pixels"
+        outputs[f"{part}_vectors"] = "(batch, 4096, keypoints, 2): direction from each cell's middle to each keypoint"
+    return Exportable(
+        name="pvnet",
+        module=PartVectors(nets),
+        weights=weights,
+        example=crops[0],
+        sizes=tuple(crops[1:]),
+        axes={"crop": {0: torch.export.Dim("batch", min=1)}},
+        inputs={"crop": CROP_TEXT.format(size=CROP)},
+        outputs=outputs,
+        about={"parts": list(nets.decoders)},
+    )
 
 
 def _faces(table: FaceTable) -> dict[str, Any]:

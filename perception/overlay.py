@@ -165,7 +165,8 @@ def _inset(
     draw_text(image, f"{number} {estimate.part} face {estimate.stable_pose}", (8, 18), colour)
     sigma_um = 1e6 * float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1], 0.0)))
     verdict = f"{estimate.verdict}, {estimate.score:.2f}" if estimate.accepted else estimate.verdict
-    draw_text(image, f"{verdict}   {sigma_um:.0f} um", (8, INSET - 10), WHITE)
+    poses = f" ({len(estimate.alternatives)} poses)" if len(estimate.alternatives) > 1 else ""
+    draw_text(image, f"{verdict}{poses}   {sigma_um:.0f} um", (8, INSET - 10), WHITE)
     edge = colour if estimate.accepted else DECLINED
     return np.asarray(
         cv2.copyMakeBorder(image, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_CONSTANT, value=edge), np.uint8

@@ -41,7 +41,7 @@ def read_photo(path: Path) -> NDArray[np.uint8]:
     except cv2.error as error:
         raise PhotoError(f"{path} cannot be decoded ({error.err}); save it anew as PNG, TIFF or JPEG") from error
     if image is None:
-        raise PhotoError(f"{path} is no picture that can be read, or is damaged; save it as PNG, TIFF or JPEG")
+        raise PhotoError(f"{path} is no picture that can be read, or is damaged; save it as 8 or 16-bit PNG or TIFF")
     if image.dtype == np.uint8:
         return np.asarray(image, np.uint8)
     if image.dtype == np.uint16:

@@ -14,7 +14,7 @@ from cad.files import write_json
 from cad.parts import Part
 from perception.calibration import table_from_board
 from perception.calibration_file import CellCalibration
-from perception.crop_poses import CROP_PX
+from perception.crop_view import CROP_PX
 from perception.estimates import Frame, FrameEstimate, PerceptionError, PoseEstimator
 from perception.overlay import draw_overlay, mask_box, save_picture, with_mask
 from perception.photo import LensCorrection, read_photo

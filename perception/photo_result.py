@@ -89,7 +89,7 @@ def _part(
                 "probability": other.probability,
                 "T_cam_part": other.T_cam_part.tolist(),
             }
-            for other in getattr(estimate, "alternatives", ())
+            for other in estimate.alternatives
         ],
         **_where(estimate, lens),
     }

@@ -101,8 +101,9 @@ def _print(result: dict[str, Any]) -> None:
     if "error" in result:
         console.print(f"{result['image']}: {result['error']}", style="red", soft_wrap=True, markup=False)
         return
-    title = f"{result['image']}: {result['tags_seen']} tags, {result['tag_rms_px']:.3f} px rms"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    tags = f"{result['tags_seen']} tags, {result['tag_rms_px']:.3f} px rms"
+    console.print(f"{result['image']}: {tags}", soft_wrap=True, markup=False)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("", "part", "face", "x mm", "y mm", "+- mm", "yaw deg", "+- deg", "score", "verdict"):
         table.add_column(name, justify="left" if name in ("part", "verdict") else "right", no_wrap=True)
     for number, part in enumerate(result["parts"]):
