@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +17,12 @@ import pytest
 from painted import PaintedMaker
 
 from scenes.dataset_config import DatasetConfig
-from scenes.dataset_folder import GENERATOR, LOCK, opened
+from scenes.dataset_folder import GENERATOR, LOCK, identity, opened
 from scenes.errors import SceneError
 from scenes.generate import Progress, generate
+from scenes.path_traced import GROUND_SAMPLES
 from scenes.ranges import SensorRanges
+from scenes.shots import TRAIN_SHOTS
 from scenes.workers import Processes, Shard, ThisProcess
 
 CONFIG = DatasetConfig(kind="crop", split="val", size=(32, 32), downscale=4, count=10, shard=4, seed=7)
@@ -181,6 +184,18 @@ def test_another_version_of_the_generator_is_refused(whole, monkeypatch):
     monkeypatch.setattr("scenes.dataset_folder.GENERATOR", GENERATOR + 1)
     with pytest.raises(SceneError, match=f"generator {GENERATOR}, not {GENERATOR + 1}"):
         generate(CONFIG, whole)
+
+
+def test_settings_that_came_later_leave_earlier_data_sets_what_they_are():
+    """They are told apart only where they change the images."""
+    none = TRAIN_SHOTS.empty_beside_px
+    assert none is None and "empty_beside_px" not in identity(CONFIG)["shots"]
+    beside = replace(TRAIN_SHOTS, target_share=0.0, empty_beside_px=(40, 130))
+    assert identity(changed(shots=beside))["shots"]["empty_beside_px"] == [40, 130]
+    frame = DatasetConfig(kind="scene", domain="mitsuba")
+    assert "samples" not in identity(frame)
+    assert identity(replace(frame, size=(5472, 3648)))["samples"]["ground"] == GROUND_SAMPLES
+    assert "samples" not in identity(replace(frame, size=(5472, 3648), domain="classic"))
 
 
 def test_a_folder_with_other_things_in_it_is_refused(tmp_path):
