@@ -94,18 +94,23 @@ class Pvnets(nn.Module):
         assert isinstance(decoder, PartDecoder)
         return decoder
 
-    def start_from(self, votes: StateDict) -> None:
-        """Take over encoder and decoders, but not their heads, from the weights of our own votes.
+    def start_from(self, state: StateDict) -> None:
+        """Take over all weights from a training of these networks, or encoder and decoders, but not their heads, from
+        one of our own votes.
 
         Raises PerceptionError when they are another network's.
         """
+        if set(state) == set(self.state_dict()):
+            self.load_state_dict(state)
+            return
         for module in (self.encoder, *(self.decoder(part) for part in self.decoders)):
             wanted = {key for key in module.state_dict() if not key.startswith("head.")}
-            if missing := sorted(wanted - set(votes)):
+            if missing := sorted(wanted - set(state)):
                 raise PerceptionError(
-                    f"the weights to start from have no {', '.join(missing[:3])}; give keypoints.safetensors, or none"
+                    f"the weights to start from have no {', '.join(missing[:3])}; give keypoints.safetensors, "
+                    "pvnet.safetensors or none"
                 )
-            module.load_state_dict({key: votes[key] for key in wanted}, strict=False)
+            module.load_state_dict({key: state[key] for key in wanted}, strict=False)
 
 
 def unit_vectors(keypoints: Tensor, cells: Tensor) -> Tensor:

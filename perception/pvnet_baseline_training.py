@@ -36,8 +36,8 @@ SAME_BRANCH = np.radians(6.0)
 
 @dataclass(frozen=True, kw_only=True)
 class PvnetConfig(CropTrainingConfig):
-    """``batch`` crops of each part a step; ``samples`` cells of each mask enter the loss. ``start`` is the weight file
-    of our own votes to start from.
+    """``batch`` crops of each part a step; ``samples`` cells of each mask enter the loss. ``start`` is a weight file to
+    start from: that of our own votes, or of an earlier training of these networks.
     """
 
     minutes: float = 30.0

@@ -71,6 +71,9 @@ def test_the_start_takes_all_but_the_heads(nets: Pvnets) -> None:
     assert torch.equal(state["decoders.a.up2.0.weight"], state["decoders.b.up2.0.weight"])
     assert torch.equal(state["decoders.a.up2.0.weight"], votes["up2.0.weight"])
     assert torch.equal(state["decoders.a.head.weight"], head)
+    again = Pvnets({"a": 8, "b": 8})
+    again.start_from(state)
+    assert torch.equal(again.decoder("a").head.weight, head)
     with pytest.raises(PerceptionError, match=r"no down1.*keypoints.safetensors"):
         started.start_from({"features.0.weight": torch.zeros(1)})
 
