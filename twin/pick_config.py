@@ -31,7 +31,7 @@ class PickConfig:
     estimator: Literal["learned", "oracle"] = "learned"
     """Who says where the parts are: the trained networks, or ground truth."""
     second_looks: tuple[LookKind, ...] = ("exposure", "park", "nudge")
-    """Other looks at what the estimator is unsure of, in this order; give the option without a value for none."""
+    """Other looks at what the estimator is unsure of, before it is declined; without a value: none."""
     exposure: float = 1.0
     """The camera's usual exposure time against a good one: above 1 what shines is too bright to be read."""
     weights: Path | None = None

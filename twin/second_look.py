@@ -19,7 +19,7 @@ from twin.views import USUAL, LookKind, View
 
 @dataclass(frozen=True, kw_only=True)
 class SecondLookConfig:
-    """Which other looks may be taken, in this order, before an unsure part is declined.
+    """Which other looks may be taken before an unsure part is declined: views in this order, pushes after them.
 
     ``exposures`` multiply the usual exposure time, ``nudges`` is how often one part may be pushed. A run takes at most
     ``max_looks`` other looks, and none once they have taken ``max_s`` of the robot's time. After several looks a
