@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +14,7 @@ from scipy.stats import beta, chi2
 from cad.spatial import Array
 from perception.bootstrap import clopper_pearson_upper
 from perception.outcomes import SYMMETRIC, Outcome
-from perception.plot_style import FAINT, colour_of, new_figure, say_empty, step_curve
+from perception.plot_style import COLOURS, FAINT, colour_of, new_figure, say_empty, step_curve
 from perception.references import BAD_SHARE, MSSD_MM, PAPER_REFINED
 
 Rows = Mapping[str, Sequence[Outcome]]
@@ -124,18 +125,21 @@ def plot_mssd_recall(rows: Rows) -> Figure:
 
 
 def plot_covariance(rows: Rows) -> Figure:
-    """Quantiles of the normalised error squared of accepted parts on the right branch, against chi-square's."""
-    figure, (panels,) = new_figure(1, 2, (4.6, 4.4), "Do the covariances hold? Accepted parts on the right branch")
+    """Quantiles of the normalised error squared of accepted parts on the right branch, against chi-square's; part by
+    part, too, when only one method states covariances.
+    """
+    figure, (panels,) = new_figure(1, 2, (4.6, 4.6), "Do the covariances hold? Accepted parts on the right branch")
     kinds = (("nees_planar", 3, "x, y, yaw (3 degrees of freedom)"), ("nees", 6, "all six degrees of freedom"))
     for axes, (name, degrees, title) in zip(panels, kinds, strict=True):
         axes.set_title(title, fontsize=10)
-        drawn = False
-        for method, outcomes in rows.items():
-            good = [o for o in outcomes if o.whole and o.accepted and o.branch_right_equivalent]
-            good = [o for o in good if getattr(o, name) is not None]
-            if good:
-                colour = colour_of(method, list(rows))
-                drawn |= _quantiles(axes, np.array([getattr(o, name) for o in good]), degrees, method, colour)
+        drawn = {method: good for method, own in rows.items() if (good := _with_covariance(own, name))}
+        for method, good in drawn.items():
+            values = np.array([getattr(o, name) for o in good])
+            _draw_band(axes, len(good), degrees)
+            _draw_quantiles(axes, values, degrees, method, color=colour_of(method, list(rows)), marker=".", ms=4, lw=0)
+            for k, part in enumerate(sorted({o.part for o in good}) if len(drawn) == 1 else []):
+                own = np.array([getattr(o, name) for o in good if o.part == part])
+                _draw_quantiles(axes, own, degrees, part, color=COLOURS[(k + 1) % len(COLOURS)], lw=1)
         if not drawn:
             say_empty(axes, "no covariances of accepted parts")
             continue
@@ -145,21 +149,28 @@ def plot_covariance(rows: Rows) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel=f"chi-square quantile, {degrees} dof")
         axes.set_ylabel("normalised error squared, quantile")
         axes.grid(color="0.92")
-        axes.legend(loc="upper left", fontsize=8)
+        axes.legend(loc="upper left", fontsize=7, title="within the 95 % bound", title_fontsize=7)
     return figure
 
 
-def _quantiles(axes: Axes, values: Array, degrees: int, method: str, colour: str) -> bool:
-    """One method's quantiles with the 95 % band in which such a sample's would lie."""
-    n = values.size
+def _with_covariance(outcomes: Sequence[Outcome], name: str) -> list[Outcome]:
+    """Accepted parts on the right branch that have this normalised error."""
+    good = [o for o in outcomes if o.whole and o.is_part and o.accepted and o.branch_right_equivalent]
+    return [o for o in good if getattr(o, name) is not None]
+
+
+def _draw_band(axes: Axes, n: int, degrees: int) -> None:
+    """Where 95 % of samples of ``n`` would lie."""
     rank = np.arange(1, n + 1)
-    expected = chi2.ppf((rank - 0.5) / n, degrees)
-    within = np.mean(values <= chi2.ppf(0.95, degrees))
     low, high = (chi2.ppf(beta.ppf(q, rank, n - rank + 1), degrees) for q in (0.025, 0.975))
-    axes.fill_between(expected, low, high, color=FAINT, alpha=0.25, linewidth=0)
-    label = f"{method}: {100 * within:.1f} % of {n} within the 95 % bound"
-    axes.plot(expected, np.sort(values), ".", ms=4, color=colour, label=label)
-    return True
+    axes.fill_between(chi2.ppf((rank - 0.5) / n, degrees), low, high, color=FAINT, alpha=0.25, linewidth=0)
+
+
+def _draw_quantiles(axes: Axes, values: Array, degrees: int, what: str, **style: Any) -> None:
+    n = values.size
+    within = np.mean(values <= chi2.ppf(0.95, degrees))
+    expected = chi2.ppf((np.arange(1, n + 1) - 0.5) / n, degrees)
+    axes.plot(expected, np.sort(values), label=f"{what}: {100 * within:.1f} % of {n}", **style)
 
 
 def _error(outcome: Outcome, name: str) -> float:

@@ -13,12 +13,12 @@ from painted import PaintedMaker
 
 from perception.bop_results import read_bop_results
 from perception.estimates import FrameEstimate
+from perception.evaluation_curves import plot_mssd_recall
 from perception.ground_truth import centre_of, read_ground_truth
+from perception.stored_detections import StoredDetections
 from scenes.recipes import load_recipe
 from twin.cli import main
 from twin.evaluation_config import EvaluationConfig
-
-PLOTS = ("risk_coverage", "cumulative_errors", "mssd_recall", "covariance", "error_over_board", "error_by_light")
 
 
 def fails(capsys, *arguments):
@@ -75,6 +75,9 @@ def poor_answer(truth):
 
 def test_everything_is_written_and_told_to_people_and_machines(told, data, weights, tmp_path, capsys, monkeypatch):
     told(tagcell=right_answer, **{"pvnet-refined": poor_answer})
+    monkeypatch.setattr(
+        "perception.evaluation_plots.PLOTS", {"mssd_recall": plot_mssd_recall}
+    )  # the others have a test
     out = tmp_path / "out"
     command = ["evaluate", "--data", str(data), "--split", "val", "--weights", str(weights), "--out", str(out)]
     main(command)
@@ -94,7 +97,7 @@ def test_everything_is_written_and_told_to_people_and_machines(told, data, weigh
     assert "mujoco" in report["versions"]
 
     methods = {"tagcell", "pvnet-refined", "pvnet"}
-    pictures = {*PLOTS, *(f"confusion_{m}" for m in methods)}
+    pictures = {"mssd_recall", *(f"confusion_{m}" for m in methods)}
     pictures |= {"failures", "failures_pvnet", "failures_pvnet-refined"}
     assert {p.stem for p in out.glob("*.png")} == pictures
     assert {p.name for p in (out / "bop").iterdir()} == {f"{m}_tagcell-val.csv" for m in methods}
@@ -224,6 +227,39 @@ def test_images_that_networks_may_have_learned_are_refused(told, capsys, data, w
     code, text = fails(capsys, "--data", data, "--split", "val", "--weights", weights, "--out", tmp_path / "out")
     assert code == 1 and "is of split 'train': networks may have learned these very images" in text
     assert "--split" in fails(capsys, "--data", data, "--split", "train")[1]
+
+
+def test_detections_of_others_come_into_the_table_if_they_are_of_these_frames(
+    no_plots, told, data, weights, tmp_path, capsys
+):
+    told(tagcell=right_answer)
+    truth = read_ground_truth(data)
+    part = truth.frames[0].parts[0]
+    result = {
+        "image_id": 0,
+        "category_id": part.part.obj_id,
+        "segmentation": part.runs,
+        "bbox": [0, 0, 1, 1],
+        "score": 0.9,
+    }
+    found = StoredDetections(
+        method="mask-rcnn",
+        weights="12",
+        data=truth.manifest,
+        min_score=0.5,
+        seconds={0: 1.0, 1: 1.0},
+        results=(result,),
+    )
+    found.write(tmp_path / "found.json")
+    command = ["--data", data, "--split", "val", "--weights", weights, "--detections", tmp_path / "found.json"]
+    main(["evaluate", *map(str, command), "--out", str(tmp_path / "out"), "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert report["segmentation_by_method"]["mask-rcnn"]["recall50"] == pytest.approx(1 / 6)
+    assert report["segmentation"]["recall50"] == 1.0
+    replace(found, data="another").write(tmp_path / "found.json")
+    code, text = fails(capsys, *command, "--out", tmp_path / "other")
+    assert code == 1 and "holds detections of the data set another" in text
+    assert not (tmp_path / "other" / "estimates").exists()
 
 
 def test_missing_weights_are_found_before_anything_is_rendered(capsys, tmp_path):
