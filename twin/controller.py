@@ -25,7 +25,7 @@ from twin.nudge import Nudge, plan_nudge
 from twin.park_pose import park_elsewhere
 from twin.robot import Camera, MotionRefused, Robot, RobotError, TwinError
 from twin.second_look import SecondLookConfig, SecondLooks
-from twin.views import USUAL, View
+from twin.views import View
 
 
 class ControllerError(TwinError):
@@ -95,23 +95,23 @@ class PickController:
         else to pick. Raises RobotError when the robot stops by itself in a move: somebody has to look at it first.
         """
         self._actions.park()
-        idle, left_behind, view, again = 0, [], USUAL, None
+        idle, left_behind, view, again = 0, [], self._second.home, None
         for _ in range(self._config.max_looks):
             seen = self._look(view) if again is None else self._look_again(again, view)
             plan, left_behind = self._choose(seen.candidates) if seen else (None, left_behind)
             again = None
             if seen and plan:
-                idle = 0
-                self._attempt(plan, seen)  # from a view that shows what can be picked: the next look is of it, too
+                idle, self._second.home = 0, view
+                self._attempt(plan, seen)
                 continue
             again = self._second.next(view, seen.candidates, self._plan_nudge) if seen else None
             if again is not None:
-                view = again if isinstance(again, View) else USUAL
+                view = again if isinstance(again, View) else self._second.home
                 continue
             idle += 1
-            if view == USUAL and (idle >= self._config.idle_looks or (seen and not left_behind)):
+            if view == self._second.home and (idle >= self._config.idle_looks or (seen and not left_behind)):
                 break
-            view = USUAL
+            view = self._second.home
         self.attempts += left_behind
         return self.attempts
 

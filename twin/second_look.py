@@ -65,7 +65,10 @@ class Doubt:
 
 
 class SecondLooks:
-    """Remembers doubtful places over the looks of a run; call ``take_in`` after each look, then ``next`` if need be."""
+    """Remembers doubtful places over the looks of a run; call ``take_in`` after each look, then ``next`` if need be.
+
+    ``home`` is the view of looks that nothing calls for: the usual one, or another that last showed something to pick.
+    """
 
     def __init__(self, config: SecondLookConfig, *, elsewhere: bool) -> None:
         """``elsewhere`` says that there is another place to park the arm which shows or shades less of the board."""
@@ -75,7 +78,8 @@ class SecondLooks:
             "park": [View(elsewhere=True)] if elsewhere else [],
             "nudge": [],
         }
-        self._views = [view for kind in config.looks for view in views[kind]]
+        self._views = [USUAL, *(view for kind in config.looks for view in views[kind])]
+        self.home = USUAL
         self._doubts: list[Doubt] = []
         self._shown: dict[View, list[Candidate]] = {}
         self._looks, self._seconds = 0, 0.0
@@ -89,8 +93,8 @@ class SecondLooks:
     def take_in(self, view: View, candidates: Sequence[Candidate]) -> list[Candidate]:
         """What a look showed, without what other looks at the same place speak against.
 
-        ``accepted`` then says how many doubtful places it settled so that there is something to pick. A usual look
-        shows what there is: a doubt about a place where it finds nothing is dropped.
+        ``accepted`` then says how many doubtful places it settled so that there is something to pick. A look
+        from ``home`` shows what there is: a doubt about a place where it finds nothing is dropped.
         """
         self._shown[view] = list(candidates)
         found: dict[int, Doubt] = {}
@@ -107,7 +111,7 @@ class SecondLooks:
             out.append(candidate)
         for doubt in self._doubts:
             doubt.tried.add(view)
-        if view == USUAL:
+        if view == self.home:
             self._doubts = [doubt for doubt in self._doubts if id(doubt) in found]
         return out
 
@@ -117,7 +121,7 @@ class SecondLooks:
         """The look to take after one of ``view`` that showed nothing to pick; None when there is none to take.
 
         ``plan`` makes a push of a candidate past all else that any view has shown, or says why there is none. Pushes
-        are planned on usual looks only: where other looks have come in between, a usual one comes first.
+        are planned on looks from ``home`` only: where others have come in between, such a one comes first.
         """
         doubts = [doubt for doubt in self._doubts if doubt.open]
         config = self.config
@@ -128,7 +132,7 @@ class SecondLooks:
                 return other
         if "nudge" not in config.looks or all(doubt.nudges >= config.nudges for doubt in doubts):
             return None
-        return self._push(candidates, plan) if view == USUAL else USUAL
+        return self._push(candidates, plan) if view == self.home else self.home
 
     def looked(self, seconds: float) -> None:
         """Count a look that ``next`` asked for and that took so long."""
