@@ -30,6 +30,8 @@ GREEN, RED, WHITE, GREY, DARK = (40, 220, 40), (255, 50, 50), (255, 255, 255), (
 TILE_PX, CAPTION_PX, BORDER_PX, COLUMNS = 256, 40, 2, 6
 TILE_M = 0.017
 """What a tile shows of the table."""
+SIDE_PX = (16, 2048)
+"""Smallest and largest side of a tile's window in the frame: raw poses may be at any distance."""
 _ARROW_M = 0.004
 _FINE = 3  # bits of a pixel's fraction that OpenCV draws with
 
@@ -64,7 +66,7 @@ def failure_tile(frame: Frame, failure: Failure) -> Image:
     if centre is None:
         raise ValueError(f"failure {failure.caption}: neither a true nor an estimated pose")
     p_cam = apply(centre.T_cam_part, centre.part.mesh.bounds.mean(axis=0))
-    side = max(8, round(TILE_M * frame.intrinsics.fx / p_cam[2]))
+    side = int(np.clip(TILE_M * frame.intrinsics.fx / max(p_cam[2], 1e-3), *SIDE_PX))
     u, v = (int(c) for c in np.round(frame.intrinsics.project(p_cam)) - side // 2)
     camera = frame.intrinsics.crop(u, v, side, side).resampled(TILE_PX, TILE_PX)
     image = _window(frame.image, u, v, side)
