@@ -4,8 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
+from cad.spatial import inverse
+from cad.tagboard import TagboardConfig
+from perception.calibration import camera_from_tags
+from perception.estimates import Frame
 from scenes.dataset_config import DatasetConfig
 from scenes.generate import generate
+from scenes.image_maker import ImageMaker
+from scenes.shots import ShotRanges
 
 CROPS = {"kind": "crop", "size": (64, 64), "downscale": 4, "count": 6, "seed": 1}
 LABELS = ("scene_gt.json", "scene_gt_info.json", "scene_gt_coco.json", "scene_camera.json")
@@ -35,3 +41,23 @@ def test_images_do_not_depend_on_shards_or_on_what_the_worker_made_before(classi
         ours = classic / "000000" / "rgb" / f"{index:06d}.png"
         theirs = tmp_path / "data" / "train" / "000001" / "rgb" / f"{index - 4:06d}.png"
         np.testing.assert_array_equal(cv2.imread(str(ours)), cv2.imread(str(theirs)))
+
+
+@pytest.mark.slow
+def test_tags_are_found_as_well_on_path_traced_ground_of_few_samples(tmp_path, monkeypatch):
+    monkeypatch.setattr("scenes.path_traced.LARGE_PX", 100_000)
+    shots = ShotRanges(scene_parts=(2, 3), scene_distractors=(0, 1), scene_crumbs=(0, 0))
+    found = {}
+    for domain in ("classic", "mitsuba"):
+        config = DatasetConfig(kind="scene", domain=domain, size=(1368, 912), seed=4, shots=shots)
+        maker = ImageMaker(config, tmp_path)
+        try:
+            made = maker.make(0)
+        finally:
+            maker.close()
+        frame = Frame(image=made.image, intrinsics=made.intrinsics, time_s=0.0)
+        found[domain] = camera_from_tags(frame, TagboardConfig())
+        difference = inverse(made.T_cam_board) @ found[domain].T_cam_board
+        assert np.linalg.norm(difference[:2, 3]) < 2e-5 and abs(difference[2, 3]) < 2e-4
+    assert found["mitsuba"].tags_seen == found["classic"].tags_seen > 15
+    assert found["mitsuba"].rms_px < 1.5 * found["classic"].rms_px
