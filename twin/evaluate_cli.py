@@ -16,10 +16,11 @@ from twin.render_cli import PARTS_HINT, Domain, Faces
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Evaluate perception on whole frames of split test, 5472 x 3648: rendered for it, or a finished data set.
+    """Measure perception on whole test frames: rendered for it, or a data set.
 
-    Writes OUT/evaluation.json and evaluation.md, plots, pictures of the worst failures, a BOP results file and COCO
-    detections. Stop it whenever you like: the same command goes on from what is finished.
+    Writes tables, plots, pictures of failures, and results in BOP and COCO form.
+
+    Stop it whenever you like: the same command goes on from what is finished.
     """
 
     domain: Annotated[Domain | None, arg(metavar="{classic,filament,mitsuba}", help_behavior_hint="")] = None

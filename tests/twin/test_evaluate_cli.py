@@ -269,3 +269,11 @@ def test_missing_weights_are_found_before_anything_is_rendered(capsys, tmp_path)
         assert code == 1 and str(tmp_path / "none") in text and "train" in text
     assert "--methods tagcell" in text
     assert not (tmp_path / "frames").exists()
+
+
+def test_help_fits_80_columns(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith("usage: tagcell evaluate") and max(map(len, text.splitlines())) <= 80
