@@ -1,11 +1,12 @@
-"""Rendered data sets as arrays in memory, with one cache file beside the data. Metres; world = board frame."""
+"""Rendered data sets as arrays, mapped from a cache beside the data. Metres; world = board frame."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,7 +21,9 @@ from perception.bop_files import DATASET, Entry, manifest_hash, read_entries, re
 from perception.calibration import table_from_board
 from perception.estimates import PerceptionError
 
-CACHE = "cache.npz"
+CACHE = "cache"
+"""Folder of a data set with its arrays, one file each: they are read where they are needed, and shared."""
+KEY = "key.txt"
 MAX_INSTANCES = 255
 
 
@@ -156,38 +159,36 @@ def load_crops(*data_dirs: Path) -> CropSet:
     return _joined([_cached(path, CropSet, _read_crops) for path in data_dirs])
 
 
-def load_windows(*data_dirs: Path) -> WindowSet:
-    """All windows or frames of some data sets, one after the other; see :func:`load_crops`."""
-    sets = [_cached(path, WindowSet, _read_windows) for path in data_dirs]
-    starts = np.cumsum([0, *map(len, sets)])
-    moved = [replace(s, image_index=s.image_index + start) for s, start in zip(sets, starts[:-1], strict=True)]
-    return _joined(moved)
+def load_windows(data_dir: Path) -> WindowSet:
+    """All windows or frames of a data set; see :func:`load_crops`."""
+    return _cached(data_dir, WindowSet, _read_windows)
 
 
 Kind = TypeVar("Kind", CropSet, WindowSet)
 
 
-def _joined(sets: Sequence[Kind]) -> Kind:
+def _joined(sets: Sequence[CropSet]) -> CropSet:
     if len(sets) == 1:
         return sets[0]
     sizes = {s.images.shape[1:] for s in sets}
     if len(sizes) != 1:
         raise PerceptionError(f"data sets of images of shapes {sorted(sizes)}: give one or more of one size")
-    kind = type(sets[0])
-    return kind(**{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(kind)})
+    return CropSet(**{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(CropSet)})
 
 
 def _cached(data_dir: Path, kind: type[Kind], read: Callable[[Path], Kind]) -> Kind:
+    """The arrays of a data set, mapped read-only from its cache, which is made anew when it is of other data."""
     key, path = f"{kind.__name__} {manifest_hash(data_dir)}", data_dir / CACHE
-    if path.exists():
-        with np.load(path, allow_pickle=False) as stored:
-            if str(stored["key"]) == key:
-                return kind(**{f.name: stored[f.name] for f in fields(kind)})
-    loaded = read(data_dir)
-    aside = path.with_name(f".{os.getpid()}.{CACHE}")
-    np.savez(aside, key=np.array(key), **{f.name: getattr(loaded, f.name) for f in fields(kind)})
-    os.replace(aside, path)
-    return loaded
+    if not (path / KEY).exists() or (path / KEY).read_text() != key:
+        loaded = read(data_dir)
+        aside = path.with_name(f".{os.getpid()}.{CACHE}")
+        aside.mkdir()
+        for f in fields(kind):
+            np.save(aside / f"{f.name}.npy", getattr(loaded, f.name))
+        (aside / KEY).write_text(key)
+        shutil.rmtree(path, ignore_errors=True)
+        os.replace(aside, path)
+    return kind(**{f.name: np.load(path / f"{f.name}.npy", mmap_mode="r") for f in fields(kind)})
 
 
 def _read_images(entries: Sequence[Entry]) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from perception.dataset import windows_of
 from perception.layers import default_device
 from perception.maskrcnn import MIN_SCORE, WEIGHTS, MaskRCNNSegmenter, build_net, torchvision_module
 from perception.segmentation import WEIGHTS as ENCODER_WEIGHTS
-from perception.segmentation import Segmenter, normalise, reduced_autocast
+from perception.segmentation import Segmenter, normalise
 from perception.train_segmentation import Examined, SegmentationTraining, examine, example, figures_of
 from perception.training import Losses, seeded, train
 from perception.weight_files import load_weights, save_weights, weights_metadata
@@ -47,7 +47,7 @@ class MaskRCNNTraining(SegmentationTraining):
 
 def visible_windows(path: Path, parts: Sequence[Part], most: int | None = None) -> Windows:
     """The windows of a data set, or the first so many, with holes left open: the pixels that the evaluation counts."""
-    return Windows(windows_of(read_entries(path)[:most]), parts, holes=True)
+    return Windows(windows_of(read_entries(path)[:most]), parts=parts, holes=True)
 
 
 def target_of(window: Window) -> dict[str, Tensor]:
@@ -96,8 +96,7 @@ def train_maskrcnn(config: MaskRCNNTraining) -> None:
         examples = [example(training[i], rng, config) for i in chosen]
         images = [torch.from_numpy(normalise(e.image)).permute(2, 0, 1).to(device) for e in examples]
         targets = [{key: value.to(device) for key, value in target_of(e).items()} for e in examples]
-        with reduced_autocast(device):
-            return net(images, targets)
+        return net(images, targets)
 
     def validate(model: nn.Module) -> dict[str, float]:
         few = validation[:: max(1, len(validation) // config.validate_windows)]

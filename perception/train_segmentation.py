@@ -224,7 +224,7 @@ def train_segmentation(config: SegmentationTraining) -> None:
     cv2.setNumThreads(config.threads)
     names = config.parts or BUILT_IN
     parts = [load_part(name, config.parts_dir) for name in names]
-    training, validation = (Windows(load_windows(*paths), parts) for paths in (config.data, config.val))
+    training, validation = (Windows(*map(load_windows, paths), parts=parts) for paths in (config.data, config.val))
     device = default_device()
     with seeded(config.seed):
         net = SegmentationNet(len(parts)).to(device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

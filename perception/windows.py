@@ -47,30 +47,33 @@ def filled(instances: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class Windows:
-    """The training windows as examples, their instances without holes unless ``holes`` are asked for.
+    """The training windows of some data sets as examples, one after the other.
 
-    Only what examples need of the set is kept, which is gigabytes.
+    Instances are without holes unless ``holes`` are asked for.
     """
 
-    def __init__(self, data: WindowSet, parts: Sequence[Part], *, holes: bool = False) -> None:
-        self.images = data.images
-        self.instances = data.instance_map if holes else np.stack([filled(each) for each in data.instance_map])
-        labels = data.labels(parts)
-        self.body_px, self.part_index = labels.body_px, labels.part_index
-        self.rows = [rows[np.argsort(data.instance[rows])] for rows in data.instances_of]
+    def __init__(self, *sets: WindowSet, parts: Sequence[Part], holes: bool = False) -> None:
+        self.sets, self.starts = sets, np.cumsum([0, *map(len, sets)])
+        self.instances = [
+            data.instance_map if holes else np.stack([filled(each) for each in data.instance_map]) for data in sets
+        ]
+        self.labels = [data.labels(parts) for data in sets]
 
     def __len__(self) -> int:
-        return len(self.images)
+        return int(self.starts[-1])
 
     def __getitem__(self, index: int) -> Window:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
-        rows = self.rows[index]
+        k = int(np.searchsorted(self.starts, index, side="right")) - 1
+        data, labels, i = self.sets[k], self.labels[k], index - int(self.starts[k])
+        rows = data.instances_of[i]
+        order = rows[np.argsort(data.instance[rows])]
         return Window(
-            image=self.images[index],
-            instances=self.instances[index],
-            centres=self.body_px[rows],
-            classes=self.part_index[rows],
+            image=np.asarray(data.images[i]),
+            instances=np.asarray(self.instances[k][i]),
+            centres=labels.body_px[order],
+            classes=labels.part_index[order],
         )
 
 
@@ -180,6 +183,6 @@ def recolour(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.u
         blurred = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.0))
         x = blurred if rng.random() < 0.6 else 2.0 * x - blurred
     if rng.random() < SHADOWED:
-        x *= shadow(*x.shape[:2], rng)[..., None]
+        x *= shadow(x.shape[0], x.shape[1], rng)[..., None]
     x += rng.normal(0.0, rng.uniform(0.0, 5.0)) + rng.standard_normal(x.shape, np.float32) * rng.uniform(0.0, 5.0)
     return np.clip(x, 0, 255).astype(np.uint8)

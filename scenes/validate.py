@@ -24,7 +24,7 @@ from scenes.targets import TARGETS, check_targets
 
 SAMPLE = 100
 """Images whose pixels are compared."""
-OURS = {"dataset.json", "manifest.json", "camera.json", "models", "rests.npz", "cache.npz", TARGETS}
+OURS = {"dataset.json", "manifest.json", "camera.json", "models", "rests.npz", "cache", TARGETS}
 SPLITS = ("train", "val", "test")
 AGAIN = "render the data set again with the same command: what is there is kept"
 
