@@ -2,8 +2,9 @@
 
 Three logistic models with a handful of weights each, fitted on validation frames. The *choice* is listwise: the score
 of a hypothesis is a weighted sum of its evidence, and scores of one crop's hypotheses are compared by softmax. The
-*gate* turns the winner's lead and its absolute evidence into the probability that it is right and good enough to act
-on; the *part* model turns the same evidence into the probability that there is a part at all.
+*gate* says how probable it is that the winner is right and good enough to act on: that its own evidence is good, times
+that its lead over its rivals is no accident. The *part* model turns the same evidence into the probability that there
+is a part at all.
 """
 
 from __future__ import annotations
@@ -65,6 +66,9 @@ GATE_FEATURES = (
 with it); the networks' log-odds that there is a part; minus the entropy of J; its own scores; the segmenter's log-odds;
 minus the tags' reprojection error in pixels; and whether the part lies inside of the frame."""
 
+RIVALRY = ("constant", "lead")
+"""Evidence that no rival of the winner is the right one."""
+
 MAX_LEAD = 8.0
 MAX_LOG_ODDS = 6.0
 MAX_BEHIND = 6.0
@@ -95,6 +99,7 @@ class ChoiceWeights:
 
     choice: dict[str, float]
     gate: dict[str, float]
+    rivalry: dict[str, float]
     part: dict[str, float]
     accept_above: float
     part_above: float = 0.5
@@ -104,7 +109,12 @@ class ChoiceWeights:
     fitted_on: str = ""
 
     def __post_init__(self) -> None:
-        for have, want in ((self.choice, FEATURES), (self.gate, GATE_FEATURES), (self.part, GATE_FEATURES)):
+        for have, want in (
+            (self.choice, FEATURES),
+            (self.gate, GATE_FEATURES),
+            (self.rivalry, RIVALRY),
+            (self.part, GATE_FEATURES),
+        ):
             if set(have) != set(want):
                 raise PerceptionError(f"weights for {', '.join(sorted(have))}; expected {', '.join(want)}: fit again")
         for name in ("accept_above", "part_above", "set_mass"):
@@ -120,7 +130,10 @@ class ChoiceWeights:
             raise PerceptionError(f"no choice weights at {path}; fit them with `python -m perception.train choice`")
         try:
             content = json.loads(path.read_text())
-            noise = {part: NoiseModel(**model) for part, model in content.pop("noise").items()}
+            noise = {
+                part: NoiseModel(**{**model, "growth": tuple(model["growth"])})
+                for part, model in content.pop("noise").items()
+            }
             return ChoiceWeights(**content, noise=noise)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise PerceptionError(f"{path} does not hold choice weights ({error!r}); fit them again") from error
@@ -128,7 +141,12 @@ class ChoiceWeights:
     def save(self, path: Path) -> None:
         """Write as JSON, under a temporary name first."""
         content: dict[str, Any] = asdict(self)
-        for name, order in (("choice", FEATURES), ("gate", GATE_FEATURES), ("part", GATE_FEATURES)):
+        for name, order in (
+            ("choice", FEATURES),
+            ("gate", GATE_FEATURES),
+            ("rivalry", RIVALRY),
+            ("part", GATE_FEATURES),
+        ):
             content[name] = {key: round(content[name][key], 5) for key in order}
         aside = path.with_name(f".{os.getpid()}.{path.name}")
         aside.write_text(json.dumps(content, indent=2) + "\n")
@@ -144,7 +162,9 @@ class ChoiceWeights:
 
     def probability_right(self, gate_evidence: Array) -> Array:
         """Probability (...) that a winner with evidence (..., len(GATE_FEATURES)) is right."""
-        return _logistic(gate_evidence @ np.array([self.gate[name] for name in GATE_FEATURES]))
+        good = _logistic(gate_evidence @ np.array([self.gate[name] for name in GATE_FEATURES]))
+        lead = gate_evidence[..., GATE_FEATURES.index("lead")]
+        return good * _logistic(self.rivalry["constant"] + self.rivalry["lead"] * lead)
 
     def probability_part(self, gate_evidence: Array) -> Array:
         """Probability (...) that a crop whose winner has evidence (..., len(GATE_FEATURES)) shows a part."""
@@ -154,6 +174,7 @@ class ChoiceWeights:
 NEUTRAL = ChoiceWeights(
     choice=dict.fromkeys(FEATURES, 0.0) | {"classifier": 1.0, "verifier": 1.0, "matched_fraction": 3.0},
     gate=dict.fromkeys(GATE_FEATURES, 0.0),
+    rivalry=dict.fromkeys(RIVALRY, 0.0),
     part=dict.fromkeys(GATE_FEATURES, 0.0),
     accept_above=0.5,
 )

@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import beta
 
 from cad.spatial import Array
-from perception.choice import AGAINST, FEATURES, GATE_FEATURES
+from perception.choice import AGAINST, FEATURES, GATE_FEATURES, RIVALRY
 from perception.estimates import PerceptionError
 
 
@@ -47,15 +47,13 @@ def fit_choice_weights(
     return dict(zip(FEATURES, (found.x / spread).tolist(), strict=True))
 
 
-def fit_logistic(evidence: Array, right: NDArray[np.bool_], penalty: float = 2e-3) -> dict[str, float]:
-    """Weights of the gate's evidence (N, len(GATE_FEATURES)) by logistic regression on ``right`` (N,) bool.
+def fit_part(evidence: Array, has_part: NDArray[np.bool_], penalty: float = 2e-3) -> dict[str, float]:
+    """Weights of the gate's evidence (N, len(GATE_FEATURES)) by logistic regression on ``has_part`` (N,) bool.
 
     No weight takes the sign that its evidence cannot have; the constant is free.
     """
-    spread = np.maximum(evidence.std(axis=0), 1e-6)
-    middle = evidence.mean(axis=0)
-    spread[0], middle[0] = 1.0, 0.0
-    x, sign = (evidence - middle) / spread, np.where(right, 1.0, -1.0)
+    x, spread, middle = _even(evidence)
+    sign = np.where(has_part, 1.0, -1.0)
 
     def loss(w: Array) -> tuple[float, Array]:
         margin = sign * (x @ w)
@@ -63,12 +61,55 @@ def fit_logistic(evidence: Array, right: NDArray[np.bool_], penalty: float = 2e-
         gradient = x.T @ slope + 2 * penalty * np.append(0.0, w[1:])
         return float(np.logaddexp(0.0, -margin).mean() + penalty * (w[1:] @ w[1:])), gradient
 
-    bounds = [
-        (None if name == "constant" or name in AGAINST else 0.0, 0.0 if name in AGAINST else None)
-        for name in GATE_FEATURES
-    ]
-    found = minimize(loss, np.zeros(len(GATE_FEATURES)), jac=True, method="L-BFGS-B", bounds=bounds)
-    weights = found.x / spread
+    found = minimize(loss, np.zeros(len(GATE_FEATURES)), jac=True, method="L-BFGS-B", bounds=_GATE_BOUNDS)
+    return _named(found.x, spread, middle)
+
+
+def fit_gate(
+    evidence: Array, right: NDArray[np.bool_], penalty: float = 2e-3
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Weights of the gate and of the rivalry, fitted together on winners with evidence (N, len(GATE_FEATURES)) that are
+    ``right`` (N,) bool.
+
+    The probability of being right is a product: a good contour is no help against a rival that scores as well. No
+    weight takes the sign that its evidence cannot have. Without examples the odds against a rival are its lead.
+    """
+    x, spread, middle = _even(evidence)
+    lead = evidence[:, GATE_FEATURES.index("lead")]
+
+    def loss(values: Array) -> tuple[float, Array]:
+        (c, s), w = values[:2], values[2:]
+        a, b = (1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0))) for odds in (x @ w, c + s * lead))
+        p = np.clip(a * b, 1e-9, 1.0 - 1e-9)
+        slope = np.where(right, -1.0 / p, 1.0 / (1.0 - p)) * p / len(x)  # by the logarithm of p
+        by_rivalry, by_gate = slope * (1.0 - b), slope * (1.0 - a)
+        total = -np.where(right, np.log(p), np.log(1.0 - p)).mean() + penalty * (w[1:] @ w[1:])
+        pull = 0.01 * np.array([c, s - 1.0])
+        gradient = np.concatenate(
+            [[by_rivalry.sum(), by_rivalry @ lead] + 2 * pull, x.T @ by_gate + 2 * penalty * np.append(0.0, w[1:])]
+        )
+        return float(total + (pull @ pull) / 0.01), gradient
+
+    start = np.append([0.0, 1.0], np.zeros(len(GATE_FEATURES)))
+    bounds = [(-1.0, None), (0.1, None), *_GATE_BOUNDS]
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    return _named(found[2:], spread, middle), dict(zip(RIVALRY, found[:2].tolist(), strict=True))
+
+
+_GATE_BOUNDS = [
+    (None if name == "constant" or name in AGAINST else 0.0, 0.0 if name in AGAINST else None) for name in GATE_FEATURES
+]
+
+
+def _even(evidence: Array) -> tuple[Array, Array, Array]:
+    """The gate's evidence with mean 0 and spread 1, but for the constant, and the spreads and means it had."""
+    spread, middle = np.maximum(evidence.std(axis=0), 1e-6), evidence.mean(axis=0)
+    spread[0], middle[0] = 1.0, 0.0
+    return (evidence - middle) / spread, spread, middle
+
+
+def _named(found: Array, spread: Array, middle: Array) -> dict[str, float]:
+    weights = found / spread
     weights[0] -= float(weights @ middle)
     return dict(zip(GATE_FEATURES, weights.tolist(), strict=True))
 

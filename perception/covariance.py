@@ -2,24 +2,32 @@
 
 An error has six parts, one for each thing that goes wrong on its own. In the table's plane, x, y and yaw of the
 contour: the covariance of Gauss-Newton, scaled, since neighbouring profiles are not independent, and a floor, since
-chamfers and shadows pull edges the same way. Off the plane, what a resting pose takes as exact: the height of the table
-below the part, read from the tags, and the part's lean on it. A wrong height moves a part along the ray to the camera,
-because its image stays where it is.
+chamfers and shadows pull edges the same way. Both grow where the contour matches the image badly: a contour that clings
+to shadows or parallel edges shows by that, not by Gauss-Newton. Off the plane, what a resting pose takes as exact: the
+height of the table below the part, read from the tags, and the part's lean on it. A wrong height moves a part along the
+ray to the camera, because its image stays where it is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cad.spatial import Array, apply, rotvec_from_rotation
+from perception.contour import Refinement
 
-GROSS = 80.0
+GROSS = 300.0
 """Normalised error squared, of six degrees, beyond which an estimate counts as an outlier when the noise is fitted."""
 FEWEST = 20
 """Estimates of a part that are needed to fit its noise."""
+QUALITIES = ("matched_fraction", "correlation", "explained")
+"""Scores of a contour, 1 for a perfect one, whose shortfall makes errors larger."""
+MOST_GROWTH = 4.0
+"""Natural logarithm of the most that a bad contour makes of an error's standard deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +35,9 @@ class NoiseModel:
     """Standard deviations that the contour's own covariance does not know of.
 
     ``scale`` multiplies the covariance of Gauss-Newton; ``floor_m`` (x and y) and ``floor_rad`` (yaw) are added to it
-    in squares. ``height_m`` is that of the table's height at the part, ``lean_rad`` that of the part's lean.
+    in squares. Both are for a perfect contour; for each of the ``QUALITIES`` ``growth`` says how much the logarithm of
+    the standard deviation grows with what the contour lacks of it. ``height_m`` is that of the table's height at the
+    part, ``lean_rad`` that of the part's lean.
     """
 
     scale: float = 4.0
@@ -35,18 +45,30 @@ class NoiseModel:
     floor_rad: float = float(np.radians(0.05))
     height_m: float = 3e-5
     lean_rad: float = float(np.radians(0.15))
+    growth: tuple[float, ...] = (0.0,) * len(QUALITIES)
 
     def __post_init__(self) -> None:
         for name in ("scale", "floor_m", "floor_rad", "height_m", "lean_rad"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be above 0")
+        if len(self.growth) != len(QUALITIES):
+            raise ValueError(f"growth = {self.growth}: must have a number for each of {', '.join(QUALITIES)}")
 
-    def inner(self, planar: Array) -> Array:
-        """Covariance (6, 6) of (x, y, yaw, height, lean, lean) from Gauss-Newton's (3, 3) of (x, y, yaw)."""
-        out = np.zeros((6, 6))
-        out[:3, :3] = self.scale * planar
-        out += np.diag(np.square([self.floor_m, self.floor_m, self.floor_rad, self.height_m, *[self.lean_rad] * 2]))
+    def flat(self, planar: Array, shortfall: Array) -> Array:
+        """Covariance (..., 3, 3) of (x, y, yaw) from Gauss-Newton's (..., 3, 3) and the shortfall (..., 3)."""
+        grown = np.exp(2 * np.minimum(shortfall @ np.array(self.growth), MOST_GROWTH))[..., None, None]
+        return grown * (self.scale * planar + np.diag(np.square([self.floor_m, self.floor_m, self.floor_rad])))
+
+    def inner(self, planar: Array, shortfall: Array) -> Array:
+        """Covariance (6, 6) of (x, y, yaw, height, lean, lean) from Gauss-Newton's (3, 3) and the shortfall (3,)."""
+        out = np.diag(np.square([0.0, 0.0, 0.0, self.height_m, self.lean_rad, self.lean_rad]))
+        out[:3, :3] = self.flat(planar, shortfall)
         return out
+
+
+def shortfall_of(contour: Refinement) -> Array:
+    """What (3,) a contour lacks of a perfect one in each of the ``QUALITIES``."""
+    return 1.0 - np.array([getattr(contour, name) for name in QUALITIES])
 
 
 def pose_jacobian(T_cam_table: Array, T_cam_part: Array, x: float, y: float) -> Array:
@@ -65,12 +87,10 @@ def pose_jacobian(T_cam_table: Array, T_cam_part: Array, x: float, y: float) -> 
     return J
 
 
-def pose_covariance(
-    planar: Array, noise: NoiseModel, T_cam_table: Array, T_cam_part: Array, x: float, y: float
-) -> Array:
-    """Covariance (6, 6) of (translation m, rotation vector rad) in ``cam`` from Gauss-Newton's (3, 3) of x, y, yaw."""
-    J = pose_jacobian(T_cam_table, T_cam_part, x, y)
-    return J @ noise.inner(planar) @ J.T
+def pose_covariance(contour: Refinement, noise: NoiseModel, T_cam_table: Array, T_cam_part: Array) -> Array:
+    """Covariance (6, 6) of (translation m, rotation vector rad) in ``cam`` of a part that a contour was laid on."""
+    J = pose_jacobian(T_cam_table, T_cam_part, contour.x, contour.y)
+    return J @ noise.inner(contour.covariance, shortfall_of(contour)) @ J.T
 
 
 def inner_error(T_cam_part_true: Array, T_cam_part: Array, T_cam_table: Array, x: float, y: float) -> Array:
@@ -80,56 +100,94 @@ def inner_error(T_cam_part_true: Array, T_cam_part: Array, T_cam_table: Array, x
     return np.asarray(np.linalg.solve(pose_jacobian(T_cam_table, T_cam_part, x, y), apart), np.float64)
 
 
-def normalised_squares(errors: Array, planars: Array, noise: NoiseModel) -> tuple[Array, Array]:
-    """Normalised errors squared (N,) of x, y, yaw (3 degrees of freedom) and of the whole pose (6).
-
-    ``errors`` (N, 6) as from :func:`inner_error`, ``planars`` (N, 3, 3) Gauss-Newton's covariances.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Errors:
+    """Errors of N estimates ``by_cause`` (N, 6) as from :func:`inner_error`, Gauss-Newton's covariances ``planar``
+    (N, 3, 3) and the shortfalls of their contours (N, 3).
     """
-    flat = noise.scale * planars + np.diag(np.square([noise.floor_m, noise.floor_m, noise.floor_rad]))
-    planar = np.einsum("ni,ni->n", errors[:, :3], np.linalg.solve(flat, errors[:, :3, None])[..., 0])
-    rest = (errors[:, 3:] / [noise.height_m, noise.lean_rad, noise.lean_rad]) ** 2
-    return planar, planar + rest.sum(axis=1)
+
+    by_cause: Array
+    planar: Array
+    shortfall: Array
+
+    def __len__(self) -> int:
+        return len(self.by_cause)
+
+    def take(self, rows: NDArray[np.bool_]) -> Errors:
+        """Some of them."""
+        return Errors(by_cause=self.by_cause[rows], planar=self.planar[rows], shortfall=self.shortfall[rows])
 
 
-def fit_noise(errors: Array, planars: Array) -> NoiseModel:
-    """The noise of greatest likelihood for errors (N, 6) and Gauss-Newton's covariances (N, 3, 3).
+def normalised_squares(errors: Errors, noise: NoiseModel) -> tuple[Array, Array]:
+    """Normalised errors squared (N,) of x, y, yaw (3 degrees of freedom) and of the whole pose (6)."""
+    e = errors.by_cause
+    scaled = np.linalg.solve(noise.flat(errors.planar, errors.shortfall), e[:, :3, None])[..., 0]
+    flat = np.einsum("ni,ni->n", e[:, :3], scaled)
+    rest = (e[:, 3:] / [noise.height_m, noise.lean_rad, noise.lean_rad]) ** 2
+    return flat, flat + rest.sum(axis=1)
 
-    Gross outliers are left out: it is for the gate to find them. With fewer than 20 estimates the usual figures.
+
+def fit_noise(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
+    """The noise of greatest likelihood of every part of which there are 20 estimates; how it grows they have in common.
+
+    Gross outliers are left out: it is for the gate to find them.
     """
-    if len(errors) < FEWEST:
-        return NoiseModel()
-    middle = 1.5 * np.median(np.abs(errors), axis=0) + 1e-9
-    noise = NoiseModel(
-        scale=1.0,
-        floor_m=float(middle[:2].mean()),
-        floor_rad=float(middle[2]),
-        height_m=float(middle[3]),
-        lean_rad=float(middle[4:].mean()),
-    )
+    enough = {part: errors for part, errors in by_part.items() if len(errors) >= FEWEST}
+    if not enough:
+        return {}
+    noise = {part: _typical(errors) for part, errors in enough.items()}
     for _ in range(2):
-        kept = normalised_squares(errors, planars, noise)[1] < GROSS
-        noise = _likeliest(errors[kept], planars[kept], noise)
+        kept = {part: e.take(normalised_squares(e, noise[part])[1] < GROSS) for part, e in enough.items()}
+        noise = _likeliest(kept)
     return noise
 
 
-def _likeliest(errors: Array, planars: Array, start: NoiseModel) -> NoiseModel:
-    unit = np.array([1e-5, 1e-5, 1e-3])  # so that all is near one
-    e, C = errors[:, :3] / unit, planars / np.outer(unit, unit)
-
-    def loss(log: Array) -> float:
-        floors = np.exp(2 * log[[1, 1, 2]])
-        S = np.exp(log[0]) * C + np.diag(floors)
-        squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
-        # A weak pull to the start decides where scale and floor can stand for each other.
-        return float(np.mean(np.linalg.slogdet(S)[1] + squares) + 1e-3 * np.sum((log - first) ** 2))
-
-    first = np.log([start.scale, start.floor_m / unit[0], start.floor_rad / unit[2]])
-    found = minimize(loss, first, method="L-BFGS-B", bounds=[(f - 7.0, f + 7.0) for f in first])
-    scale, floor_m, floor_rad = np.exp(found.x) * [1.0, unit[0], unit[2]]
+def _typical(errors: Errors) -> NoiseModel:
+    """Standard deviations that half of the errors suggest."""
+    x, y, yaw, height, *lean = 1.5 * np.median(np.abs(errors.by_cause), axis=0) + 1e-9
     return NoiseModel(
-        scale=float(scale),
-        floor_m=float(floor_m),
-        floor_rad=float(floor_rad),
-        height_m=float(np.sqrt(np.mean(errors[:, 3] ** 2)) + 1e-7),
-        lean_rad=float(np.sqrt(np.mean(errors[:, 4:] ** 2)) + 1e-6),
+        scale=1.0,
+        floor_m=float(x + y) / 2,
+        floor_rad=float(yaw),
+        height_m=float(height),
+        lean_rad=float(np.mean(lean)),
     )
+
+
+_UNIT = np.array([1e-5, 1e-5, 1e-3])  # so that all is near one
+_START = np.log([100.0, 1.0, 1.0])
+
+
+def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
+    parts = list(by_part)
+    count = sum(len(errors) for errors in by_part.values())
+
+    def unpacked(values: Array) -> dict[str, NoiseModel]:
+        growth = tuple(values[3 * len(parts) :].tolist())
+        logs = values[: 3 * len(parts)].reshape(-1, 3)
+        return {
+            part: NoiseModel(
+                scale=float(np.exp(scale)),
+                floor_m=float(np.exp(floor) * _UNIT[0]),
+                floor_rad=float(np.exp(floor_yaw) * _UNIT[2]),
+                height_m=float(np.sqrt(np.mean(by_part[part].by_cause[:, 3] ** 2)) + 1e-7),
+                lean_rad=float(np.sqrt(np.mean(by_part[part].by_cause[:, 4:] ** 2)) + 1e-6),
+                growth=growth,
+            )
+            for part, (scale, floor, floor_yaw) in zip(parts, logs, strict=True)
+        }
+
+    def loss(values: Array) -> float:
+        total = 0.0
+        for part, noise in unpacked(values).items():
+            errors = by_part[part]
+            S = noise.flat(errors.planar, errors.shortfall) / np.outer(_UNIT, _UNIT)
+            e = errors.by_cause[:, :3] / _UNIT
+            squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
+            total += float((np.linalg.slogdet(S)[1] + squares).sum()) / count
+        # A weak pull to the start decides where scale, floor and growth can stand for each other.
+        return total + 1e-3 * float(np.sum((values - first) ** 2))
+
+    first = np.append(np.tile(_START, len(parts)), np.zeros(len(QUALITIES)))
+    bounds = [(value - 8.0, value + 8.0) for value in first[: 3 * len(parts)]] + [(0.0, 10.0)] * len(QUALITIES)
+    return unpacked(minimize(loss, first, method="L-BFGS-B", bounds=bounds).x)

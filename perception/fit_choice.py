@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 from cad.spatial import Array
 from perception.alternatives import likely_readings, reading_probabilities
 from perception.bop_files import manifest_hash
-from perception.choice import NEUTRAL, ChoiceWeights, gate_evidence
+from perception.choice import FEATURES, NEUTRAL, ChoiceWeights, gate_evidence
 from perception.choice_evidence import CropFindings, FrameFindings, collect
 from perception.choice_models import (
     cautious_threshold,
     fit_choice_weights,
-    fit_logistic,
+    fit_gate,
+    fit_part,
     fit_temperature,
     wrong_share_bound,
 )
-from perception.covariance import fit_noise, normalised_squares
+from perception.covariance import QUALITIES, Errors, fit_noise, normalised_squares
 from perception.crop_poses import SAME_PLACE_M
 from perception.estimates import PerceptionError
 from perception.estimator import CHOICE_FILE, EstimatorConfig
@@ -119,11 +120,8 @@ def cross_fitted(frames: Sequence[Sequence[CropFindings]], folds: int) -> tuple[
         mine = [crop for frame in frames[fold::folds] for crop in frame]
         weights = replace(NEUTRAL, choice=choice_of([crop for frame in rest[::2] for crop in frame]))
         seen = winners_of([crop for frame in rest[1::2] for crop in frame], weights)
-        weights = replace(
-            weights,
-            gate=fit_logistic(seen.evidence, seen.usable),
-            part=fit_logistic(seen.evidence, seen.has_part),
-        )
+        gate, rivalry = fit_gate(seen.evidence, seen.usable)
+        weights = replace(weights, gate=gate, rivalry=rivalry, part=fit_part(seen.evidence, seen.has_part))
         new = winners_of(mine, weights)
         parts.append(
             replace(
@@ -153,14 +151,16 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
 
     choice = choice_of(ordered)
     winners = winners_of(ordered, replace(NEUTRAL, choice=choice))
+    gate, rivalry = fit_gate(winners.evidence, winners.usable)
     weights = ChoiceWeights(
         choice=choice,
-        gate=fit_logistic(winners.evidence, winners.usable),
-        part=fit_logistic(winners.evidence, winners.has_part),
+        gate=gate,
+        rivalry=rivalry,
+        part=fit_part(winners.evidence, winners.has_part),
         accept_above=threshold,
         temperature=temperature,
         set_mass=mass,
-        noise={part: fit_noise(*errors_of(found)) for part, found in sorted(_by_part(ordered, choice).items())},
+        noise=fit_noise(errors_by_part(ordered, choice)),
     )
     return weights, _figures(findings, ordered, scores, held_out, weights)
 
@@ -169,21 +169,25 @@ Winner = tuple[CropFindings, int]
 """A crop and the index of its winner."""
 
 
-def errors_of(winners: Sequence[Winner]) -> tuple[Array, Array]:
-    """Errors (N, 6) of winners and Gauss-Newton's covariances (N, 3, 3)."""
-    errors = np.array([crop.errors[best] for crop, best in winners], np.float64).reshape(-1, 6)
-    return errors, np.array([crop.planar[best] for crop, best in winners], np.float64).reshape(-1, 3, 3)
+def errors_of(winners: Sequence[Winner]) -> Errors:
+    """Errors of winners that are usable."""
+    columns = [FEATURES.index(name) for name in QUALITIES]
+    return Errors(
+        by_cause=np.array([crop.errors[best] for crop, best in winners], np.float64).reshape(-1, 6),
+        planar=np.array([crop.planar[best] for crop, best in winners], np.float64).reshape(-1, 3, 3),
+        shortfall=1.0 - np.array([crop.evidence[best] for crop, best in winners])[:, columns],
+    )
 
 
-def _by_part(crops: Sequence[CropFindings], choice: dict[str, float]) -> dict[str, list[Winner]]:
-    """The winners that are usable, by part."""
+def errors_by_part(crops: Sequence[CropFindings], choice: dict[str, float]) -> dict[str, Errors]:
+    """Errors of the winners that are usable, by part."""
     weights = replace(NEUTRAL, choice=choice)
     out: dict[str, list[Winner]] = {}
     for crop in crops:
         best = winner_of(crop, weights)[0]
         if crop.errors[best] is not None:
             out.setdefault(crop.part, []).append((crop, best))
-    return out
+    return {part: errors_of(found) for part, found in sorted(out.items())}
 
 
 def normalised_errors(findings: Sequence[FrameFindings], choice: dict[str, float]) -> dict[str, dict[str, float]]:
@@ -192,15 +196,11 @@ def normalised_errors(findings: Sequence[FrameFindings], choice: dict[str, float
     """
     seen: dict[str, list[tuple[float, float]]] = {}
     for half in (0, 1):
-        fitted = {
-            part: fit_noise(*errors_of(found))
-            for part, found in _by_part([c for f in findings[half::2] for c in f.crops if c.whole], choice).items()
-        }
+        fitted = fit_noise(errors_by_part([c for f in findings[half::2] for c in f.crops if c.whole], choice))
         for frame in findings[1 - half :: 2]:
-            for part, found in _by_part([c for c in frame.crops if c.whole], choice).items():
+            for part, errors in errors_by_part([c for c in frame.crops if c.whole], choice).items():
                 if part in fitted:
-                    squares = zip(*normalised_squares(*errors_of(found), fitted[part]), strict=True)
-                    for pair in squares:
+                    for pair in zip(*normalised_squares(errors, fitted[part]), strict=True):
                         for name in (f"{part}, {frame.domain}", part):
                             seen.setdefault(name, []).append(pair)
     return {

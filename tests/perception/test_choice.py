@@ -7,7 +7,8 @@ from perception.choice import FEATURES, GATE_FEATURES, ChoiceWeights, CropContex
 from perception.choice_models import (
     cautious_threshold,
     fit_choice_weights,
-    fit_logistic,
+    fit_gate,
+    fit_part,
     fit_temperature,
     wrong_share_bound,
 )
@@ -17,6 +18,7 @@ from perception.estimates import PerceptionError
 PLAIN = ChoiceWeights(
     choice=dict.fromkeys(FEATURES, 1.0),
     gate=dict.fromkeys(GATE_FEATURES, 0.5),
+    rivalry={"constant": 0.5, "lead": 2.0},
     part=dict.fromkeys(GATE_FEATURES, 0.25),
     accept_above=0.5,
     noise={"block": NoiseModel(floor_m=2e-5)},
@@ -43,23 +45,44 @@ def test_fitted_weights_find_the_evidence_that_matters() -> None:
     ranked = sorted(FEATURES, key=lambda name: -abs(weights[name]))
     assert ranked[:2] == ["verifier", "matched_fraction"]
     assert weights["verifier"] == pytest.approx(2.0, abs=0.6)  # the log likelihood ratio of unit normals 2 apart
-    fitted = ChoiceWeights(choice=weights, gate=PLAIN.gate, part=PLAIN.part, accept_above=0.5)
+    fitted = ChoiceWeights(choice=weights, gate=PLAIN.gate, rivalry=PLAIN.rivalry, part=PLAIN.part, accept_above=0.5)
     share = np.mean([r[int(fitted.scores(e).argmax())] for e, r in zip(evidence, right, strict=True)])
     assert share > 0.85
 
 
-def test_gate_is_calibrated_and_keeps_its_signs() -> None:
-    rng = np.random.default_rng(1)
-    evidence = rng.normal(size=(4000, len(GATE_FEATURES)))
-    evidence[:, 0] = 1.0
-    right = rng.random(4000) < 1 / (1 + np.exp(-(1.0 + 1.5 * evidence[:, 1] - 0.5 * evidence[:, 6])))
-    fitted = fit_logistic(evidence, right)
-    p = ChoiceWeights(choice=PLAIN.choice, gate=fitted, part=PLAIN.part, accept_above=0.5).probability_right(evidence)
+def calibrated(p: np.ndarray, right: np.ndarray) -> None:
     for low in (0.2, 0.4, 0.6, 0.8):
         inside = (p >= low) & (p < low + 0.2)
         assert right[inside].mean() == pytest.approx(p[inside].mean(), abs=0.05)
-    assert fitted[GATE_FEATURES[6]] == 0.0  # evidence that cannot speak against a hypothesis
-    assert fitted["region_unexplained"] <= 0.0
+
+
+def test_probabilities_are_calibrated_and_weights_keep_their_signs() -> None:
+    rng = np.random.default_rng(1)
+    evidence = rng.normal(size=(6000, len(GATE_FEATURES)))
+    evidence[:, 0] = 1.0
+    lead, matched, tags = (GATE_FEATURES.index(name) for name in ("lead", "matched_fraction", "tags"))
+    has_part = rng.random(6000) < 1 / (1 + np.exp(-(1.0 + 1.5 * evidence[:, matched] - 0.5 * evidence[:, tags])))
+    part = fit_part(evidence, has_part)
+    assert part["tags"] == 0.0  # evidence that cannot speak against a part
+    assert part["region_unexplained"] <= 0.0
+    evidence[:, lead] = rng.exponential(2.0, 6000)
+    good = 1 / (1 + np.exp(-(1.0 + 1.5 * evidence[:, matched])))
+    right = rng.random(6000) < good / (1 + np.exp(-1.2 * evidence[:, lead]))
+    gate, rivalry = fit_gate(evidence, right)
+    weights = ChoiceWeights(choice=PLAIN.choice, gate=gate, rivalry=rivalry, part=part, accept_above=0.5)
+    calibrated(weights.probability_right(evidence), right)
+    calibrated(weights.probability_part(evidence), has_part)
+    assert rivalry["lead"] == pytest.approx(1.2, abs=0.3)
+    assert gate["matched_fraction"] == pytest.approx(1.5, abs=0.2)
+
+
+def test_a_perfect_contour_does_not_help_against_an_equal_rival() -> None:
+    gate = np.full(len(GATE_FEATURES), 50.0)
+    gate[GATE_FEATURES.index("lead")] = 0.0
+    even = ChoiceWeights(
+        choice=PLAIN.choice, gate=PLAIN.gate, rivalry={"constant": 0.0, "lead": 1.0}, part=PLAIN.part, accept_above=0.5
+    )
+    assert even.probability_right(gate) == pytest.approx(0.5)
 
 
 def test_temperature_is_found_again() -> None:
@@ -140,6 +163,8 @@ def test_missing_and_unfit_weights_are_errors(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="fit them again"):
         ChoiceWeights.load(tmp_path / "odd.json")
     with pytest.raises(PerceptionError, match="expected classifier"):
-        ChoiceWeights(choice={"verifier": 1.0}, gate=PLAIN.gate, part=PLAIN.part, accept_above=0.5)
+        ChoiceWeights(
+            choice={"verifier": 1.0}, gate=PLAIN.gate, rivalry=PLAIN.rivalry, part=PLAIN.part, accept_above=0.5
+        )
     with pytest.raises(PerceptionError, match="nothing to fit"):
         fit_choice_weights([np.zeros((1, len(FEATURES)))], [np.array([True])])

@@ -5,13 +5,32 @@ import pytest
 
 from cad.parts import planar
 from cad.spatial import rotation_from_rotvec, rotation_x, transform
-from perception.covariance import NoiseModel, fit_noise, inner_error, normalised_squares, pose_covariance
+from perception.contour import Refinement
+from perception.covariance import (
+    Errors,
+    NoiseModel,
+    fit_noise,
+    inner_error,
+    normalised_squares,
+    pose_covariance,
+    shortfall_of,
+)
 
 T_CAM_TABLE = transform(rotation_x(np.pi + 0.02), [0.01, -0.02, 0.7])
 T_REST = transform(rotation_from_rotvec([0.4, -0.2, 0.9]), [1e-3, -5e-4, 1.5e-3])
 AT = (0.11, -0.06, 0.7)
-CONTOUR = np.diag(np.square([4e-6, 6e-6, 4e-4]))
-NOISE = NoiseModel(scale=2.0, floor_m=1e-5, floor_rad=1e-3, height_m=4e-5, lean_rad=3e-3)
+GAUSS_NEWTON = np.diag(np.square([4e-6, 6e-6, 4e-4]))
+CONTOUR = Refinement(
+    x=AT[0],
+    y=AT[1],
+    yaw=AT[2],
+    covariance=GAUSS_NEWTON,
+    matched_fraction=0.7,
+    matched_outline=0.8,
+    correlation=0.9,
+    explained=0.95,
+)
+NOISE = NoiseModel(scale=2.0, floor_m=1e-5, floor_rad=1e-3, height_m=4e-5, lean_rad=3e-3, growth=(2.0, 0.5, 4.0))
 
 
 def pose(x: float, y: float, yaw: float, height: float = 0.0, lean: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
@@ -25,8 +44,8 @@ def pose(x: float, y: float, yaw: float, height: float = 0.0, lean: tuple[float,
 
 def test_covariance_is_that_of_sampled_poses() -> None:
     rng, T = np.random.default_rng(0), pose(*AT)
-    stated = pose_covariance(CONTOUR, NOISE, T_CAM_TABLE, T, AT[0], AT[1])
-    flat = NOISE.scale * CONTOUR + np.diag(np.square([NOISE.floor_m, NOISE.floor_m, NOISE.floor_rad]))
+    stated = pose_covariance(CONTOUR, NOISE, T_CAM_TABLE, T)
+    flat = NOISE.flat(GAUSS_NEWTON, shortfall_of(CONTOUR))
     squares = []
     for x, y, yaw in rng.multivariate_normal(AT, flat, 3000):
         lean = (rng.normal(0, NOISE.lean_rad), rng.normal(0, NOISE.lean_rad))
@@ -49,30 +68,48 @@ def test_each_cause_is_found_again_in_the_error() -> None:
 
 def test_a_higher_table_moves_a_part_along_its_ray_alone() -> None:
     tight = replace(NOISE, scale=1e-6, floor_m=1e-9, floor_rad=1e-9, lean_rad=1e-9)
-    C = pose_covariance(CONTOUR, tight, T_CAM_TABLE, pose(*AT), AT[0], AT[1])
+    C = pose_covariance(CONTOUR, tight, T_CAM_TABLE, pose(*AT))
     foot = T_CAM_TABLE @ [AT[0], AT[1], 0.0, 1.0]
     ray = foot[:3] / np.linalg.norm(foot[:3])
     across = np.eye(3) - np.outer(ray, ray)
     assert np.trace(across @ C[:3, :3] @ across) < 1e-4 * np.trace(C[:3, :3])
 
 
+def draw(n: int, rng: np.random.Generator, noise: NoiseModel = NOISE) -> Errors:
+    contours = GAUSS_NEWTON * rng.uniform(0.3, 3.0, n)[:, None, None]
+    shortfall = rng.uniform(0.0, [0.7, 0.4, 0.3], (n, 3))
+    errors = [rng.multivariate_normal(np.zeros(6), noise.inner(C, s)) for C, s in zip(contours, shortfall, strict=True)]
+    return Errors(by_cause=np.array(errors), planar=contours, shortfall=shortfall)
+
+
 def test_fitted_noise_holds_on_other_errors() -> None:
     rng = np.random.default_rng(1)
+    other = replace(NOISE, floor_m=3e-5, floor_rad=4e-3)
+    seen = {"a": draw(300, rng), "b": draw(300, rng, other)}
+    seen["a"].by_cause[:3, 0] = 3e-3  # a rim taken for the outline
+    fitted = fit_noise(seen)
+    for part, noise in (("a", NOISE), ("b", other)):
+        new = draw(2000, rng, noise)
+        flat, whole = normalised_squares(new, fitted[part])
+        assert flat.mean() == pytest.approx(3.0, abs=0.4)
+        assert whole.mean() == pytest.approx(6.0, abs=0.6)
+        bad = new.shortfall[:, 0] > 0.4
+        assert flat[bad].mean() == pytest.approx(3.0, abs=0.6)  # it grows as it should where contours are bad
+    assert fitted["a"].height_m == pytest.approx(NOISE.height_m, rel=0.15)
 
-    def draw(n: int) -> tuple[np.ndarray, np.ndarray]:
-        contours = CONTOUR * rng.uniform(0.3, 3.0, n)[:, None, None]
-        return np.array([rng.multivariate_normal(np.zeros(6), NOISE.inner(C)) for C in contours]), contours
 
-    errors, contours = draw(300)
-    errors[:3, 0] = 2.5e-4  # a rim taken for the outline
-    fitted = fit_noise(errors, contours)
-    planar_squares, all_squares = normalised_squares(*draw(2000), fitted)
-    assert planar_squares.mean() == pytest.approx(3.0, abs=0.4)
-    assert all_squares.mean() == pytest.approx(6.0, abs=0.6)
-    assert fitted.height_m == pytest.approx(NOISE.height_m, rel=0.15)
+def test_a_worse_contour_has_a_larger_covariance_up_to_a_limit() -> None:
+    def size(**scores: float) -> float:
+        return float(np.linalg.det(NOISE.flat(GAUSS_NEWTON, shortfall_of(replace(CONTOUR, **scores)))))
+
+    assert size(matched_fraction=1.0) < size() < size(matched_fraction=0.2) < size(matched_fraction=0.2, explained=0.5)
+    bad = dict.fromkeys(("matched_fraction", "correlation", "explained"), -9.0)
+    assert size(**bad) == size(**dict.fromkeys(bad, -10.0))
 
 
 def test_few_errors_say_nothing() -> None:
-    assert fit_noise(np.zeros((5, 6)), np.tile(CONTOUR, (5, 1, 1))) == NoiseModel()
+    assert fit_noise({"a": draw(5, np.random.default_rng(2))}) == {}
     with pytest.raises(ValueError, match="floor_m"):
         NoiseModel(floor_m=0.0)
+    with pytest.raises(ValueError, match="growth"):
+        NoiseModel(growth=(1.0,))

@@ -21,6 +21,7 @@ from perception.silhouette import render_view, silhouette_mask
 WEIGHTS = ChoiceWeights(
     choice=dict.fromkeys(FEATURES, 0.0) | {"matched_fraction": 10.0, "region_unexplained": -80.0, "keypoints": 0.3},
     gate=dict.fromkeys(GATE_FEATURES, 0.0) | {"constant": -2.0, "lead": 1.5, "matched_fraction": 4.0},
+    rivalry={"constant": 0.0, "lead": 1.0},
     part=dict.fromkeys(GATE_FEATURES, 0.0) | {"is_part": 1.0},
     accept_above=0.5,
 )
