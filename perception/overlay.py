@@ -34,8 +34,8 @@ BORDER = 2
 INSET_M = 0.017  # and what it shows of the table
 OVERVIEW_WIDTH = 1368  # pixels, about
 ELLIPSE_SIGMAS = 2.0
-ELLIPSE_SCALE = 50.0
-"""Error ellipses are drawn this many times larger than they are: 2 sigma of 5 um becomes 0.5 mm."""
+ELLIPSE_SCALE = 20.0
+"""Error ellipses are drawn this many times larger than they are: 2 sigma of 20 um becomes 0.8 mm."""
 FINE = 3  # bits of a pixel's fraction that OpenCV draws with
 
 
