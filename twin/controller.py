@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cad.parts import Part
-from cad.spatial import Array, inverse
+from cad.spatial import Array, apply, inverse
 from perception.estimates import Frame, FrameEstimate, PerceptionError, PoseEstimator
 from twin.actions import ActionFailed, Actions
 from twin.attempts import Attempt, Calibration, ControllerConfig, Outcome
@@ -135,7 +135,11 @@ class PickController:
             for seen in estimate.parts
             if seen.part in self._parts
         ]
-        return Seen(frame=frame, estimate=estimate, view=view, candidates=self._second.take_in(view, candidates))
+        others = [
+            apply(T_base_cam, seen.T_cam_part[:3, 3])[:2] for seen in estimate.parts if seen.part not in self._parts
+        ]
+        candidates = self._second.take_in(view, candidates, others)
+        return Seen(frame=frame, estimate=estimate, view=view, candidates=candidates)
 
     def _look_again(self, again: View | Nudge, view: View) -> Seen | None:
         """Another look at what is in doubt, after a push if it takes one, and an account of it."""
@@ -163,7 +167,7 @@ class PickController:
         finally:
             self._on_event(NudgeFinished(nudge=nudge, note=note))
 
-    def _plan_nudge(self, target: Candidate, others: list[Candidate]) -> Nudge | str:
+    def _plan_nudge(self, target: Candidate, others: list[Array]) -> Nudge | str:
         return plan_nudge(
             target,
             others,

@@ -64,7 +64,7 @@ class Nudge:
 
 def plan_nudge(
     target: Candidate,
-    others: Sequence[Candidate],
+    others: Sequence[Array],
     *,
     radius_m: float,
     solve: Callable[[Array], Array],
@@ -74,10 +74,10 @@ def plan_nudge(
     """The push with the most room around it, or why there is none.
 
     ``radius_m`` is the largest distance of a point of any part from its middle: what lies there may not be what it is
-    taken for. ``others`` is all else that is seen. ``solve`` turns ``T_base_tcp`` into joint angles (6,) and raises
-    TwinError where the arm cannot reach.
+    taken for. ``others`` are the middles (2,) of all else that is seen. ``solve`` turns ``T_base_tcp`` into joint
+    angles (6,) and raises TwinError where the arm cannot reach.
     """
-    centres = np.array([other.centre for other in others]).reshape(-1, 2)
+    centres = np.array(others).reshape(-1, 2)
     options: list[Nudge] = []
     on_board = False
     for heading in 2 * np.pi * np.arange(config.directions) / config.directions:

@@ -81,7 +81,7 @@ class SecondLooks:
         self._views = [USUAL, *(view for kind in config.looks for view in views[kind])]
         self.home = USUAL
         self._doubts: list[Doubt] = []
-        self._shown: dict[View, list[Candidate]] = {}
+        self._shown: dict[View, list[Array]] = {}
         self._looks, self._seconds = 0, 0.0
         self.accepted = 0
 
@@ -90,13 +90,14 @@ class SecondLooks:
         """How many places are in doubt."""
         return sum(doubt.open for doubt in self._doubts)
 
-    def take_in(self, view: View, candidates: Sequence[Candidate]) -> list[Candidate]:
+    def take_in(self, view: View, candidates: Sequence[Candidate], others: Sequence[Array] = ()) -> list[Candidate]:
         """What a look showed, without what other looks at the same place speak against.
 
+        ``others`` are the places (2,) of what it showed besides, that no push may touch.
         ``accepted`` then says how many doubtful places it settled so that there is something to pick. A look
         from ``home`` shows what there is: a doubt about a place where it finds nothing is dropped.
         """
-        self._shown[view] = list(candidates)
+        self._shown[view] = [*(candidate.centre for candidate in candidates), *others]
         found: dict[int, Doubt] = {}
         out = []
         self.accepted = 0
@@ -116,7 +117,7 @@ class SecondLooks:
         return out
 
     def next(
-        self, view: View, candidates: Sequence[Candidate], plan: Callable[[Candidate, list[Candidate]], Nudge | str]
+        self, view: View, candidates: Sequence[Candidate], plan: Callable[[Candidate, list[Array]], Nudge | str]
     ) -> View | Nudge | None:
         """The look to take after one of ``view`` that showed nothing to pick; None when there is none to take.
 
@@ -162,7 +163,7 @@ class SecondLooks:
         return candidate
 
     def _push(
-        self, candidates: Sequence[Candidate], plan: Callable[[Candidate, list[Candidate]], Nudge | str]
+        self, candidates: Sequence[Candidate], plan: Callable[[Candidate, list[Array]], Nudge | str]
     ) -> Nudge | None:
         nudges = []
         for candidate in candidates:
@@ -170,7 +171,7 @@ class SecondLooks:
             if doubt is None or not doubt.open or doubt.nudges >= self.config.nudges:
                 continue
             seen = [other for shown in self._shown.values() for other in shown]
-            nudge = plan(candidate, [other for other in seen if not self._near(other.centre, candidate.centre)])
+            nudge = plan(candidate, [other for other in seen if not self._near(other, candidate.centre)])
             if isinstance(nudge, Nudge):
                 nudges.append((doubt.nudges, -nudge.free_m, nudge))
         return min(nudges, key=lambda n: n[:2])[2] if nudges else None
@@ -178,7 +179,7 @@ class SecondLooks:
     def _vacate(self, centre: Array) -> None:
         """Nothing that was shown at a place is there any more."""
         for view, shown in self._shown.items():
-            self._shown[view] = [other for other in shown if not self._near(other.centre, centre)]
+            self._shown[view] = [other for other in shown if not self._near(other, centre)]
 
     def _near(self, a: Array, b: Array) -> bool:
         return float(np.linalg.norm(a - b)) < self.config.same_place_m

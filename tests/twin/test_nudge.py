@@ -35,7 +35,7 @@ def lying(x, y, yaw=0.0):
 def plan(target, others=(), solve=lambda T: np.zeros(6), **config):
     return plan_nudge(
         target,
-        others,
+        [other.centre for other in others],
         radius_m=PART.radius_m,
         solve=solve,
         calibration=CALIBRATION,

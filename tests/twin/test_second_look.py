@@ -106,12 +106,15 @@ def test_a_push_that_is_refused_is_not_made_and_the_one_with_most_room_comes_fir
 def test_pushes_keep_clear_of_what_any_view_has_shown_and_of_nothing_that_has_gone(brick):
     looks = SecondLooks(SecondLookConfig(looks=("exposure", "nudge")), elsewhere=False)
     doubtful, hidden, picked = candidate(brick), candidate(brick, 0.02), candidate(brick, 0.04)
+    foreign = np.array([0.3, 0.0])
     for view, seen in ((USUAL, [doubtful]), (DARK, [doubtful, hidden, picked]), (BRIGHT, []), (USUAL, [doubtful])):
-        looks.take_in(view, seen)
+        looks.take_in(view, seen, [foreign] if view == BRIGHT else [])
     looks.forget(picked.centre)
     asked = []
     looks.next(USUAL, [doubtful], lambda target, others: asked.append((target, others)) or "no")
-    assert asked == [(doubtful, [hidden])]
+    ((target, others),) = asked
+    assert target is doubtful
+    np.testing.assert_array_equal(others, [hidden.centre, foreign])
 
 
 def test_log_probabilities_of_a_reading_add_over_looks(brick):
