@@ -36,6 +36,8 @@ PYRAMID = 48
 REPRESENTATION = 192
 ANCHORS_PX = ((12, 18), (26, 36), (48, 64))
 """Sides of the anchors at each stride, each at three aspect ratios."""
+SIZE_DIVISOR = 32
+"""Images are padded to whole multiples of this."""
 MIN_SCORE = 0.05
 """torchvision's own default: what is below is not reported at all."""
 DUPLICATE_IOU = 0.5
@@ -65,13 +67,16 @@ class _Backbone(nn.Module):
         self.out_channels = PYRAMID
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
-        """Features by level, "0" the finest, of normalised images (B, 3, H, W)."""
-        x = self.stem(images.contiguous(memory_format=torch.channels_last))
+        """Features by level, "0" the finest, of normalised images (B, 3, H, W).
+
+        Only what is here is computed in bfloat16: it has too few digits for the coordinates of boxes.
+        """
         levels: OrderedDict[str, Tensor] = OrderedDict()
-        for i, stage in enumerate(self.stages):
-            levels[str(i)] = x = stage(x)
-        with torch.autocast(images.device.type, enabled=False):
-            return self.pyramid(OrderedDict((key, value.float()) for key, value in levels.items()))
+        with reduced_autocast(images.device):
+            x = self.stem(images.contiguous(memory_format=torch.channels_last))
+            for i, stage in enumerate(self.stages):
+                levels[str(i)] = x = stage(x)
+        return self.pyramid(OrderedDict((key, value.float()) for key, value in levels.items()))
 
 
 def build_net(n_parts: int, segmenter: SegmentationNet) -> nn.Module:
@@ -164,22 +169,22 @@ class MaskRCNNSegmenter:
 
         Detections below ``min_score`` (by default the segmenter's own) are left out. Centres are in frame pixels.
         """
-        ops = torchvision_module("torchvision.ops")
-        x = torch.from_numpy(normalise(image)).permute(2, 0, 1).to(self.device)
-        with torch.inference_mode(), reduced_autocast(self.device):
-            images, _ = self.net.transform([x])
-            features = self.net.backbone(images.tensors)
+        ops, lists = (torchvision_module(f"torchvision.{name}") for name in ("ops", "models.detection.image_list"))
+        size = image.shape[:2]
+        bottom, right = (-side % SIZE_DIVISOR for side in size)
+        padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REFLECT_101)
+        x = torch.from_numpy(normalise(np.asarray(padded, np.uint8))).permute(2, 0, 1)[None].to(self.device)
+        with torch.inference_mode():  # without torchvision's own transform, which would resize the image
+            images, features = lists.ImageList(x, [size]), self.net.backbone(x)
             proposals, _ = self.net.rpn(images, features)
             (found,), _ = self.net.roi_heads(features, proposals, images.image_sizes)
-        score = found["scores"].float()
-        enough = score >= (self.min_score if min_score is None else min_score)
-        kept = ops.nms(found["boxes"].float(), score, DUPLICATE_IOU)
+        enough = found["scores"] >= (self.min_score if min_score is None else min_score)
+        kept = ops.nms(found["boxes"], found["scores"], DUPLICATE_IOU)
         kept = kept[enough[kept]].cpu().numpy()  # best first
-        boxes, labels = found["boxes"].float().cpu().numpy(), found["labels"].cpu().numpy()
-        masks, score = found["masks"].float().cpu().numpy()[:, 0], score.cpu().numpy()
+        boxes, labels, masks, score = (found[key].cpu().numpy() for key in ("boxes", "labels", "masks", "scores"))
         finer, out = np.broadcast_to(np.asarray(finer, np.float64), (2,)), []
         for k in kept:
-            mask, origin = paste(masks[k], boxes[k].astype(np.float64), finer)
+            mask, origin = paste(masks[k, 0], boxes[k].astype(np.float64), finer)
             mask, origin = _trimmed(mask, origin, np.array(image.shape[1::-1]) * finer)
             if mask.any():
                 middle = (boxes[k, :2].astype(np.float64) + boxes[k, 2:]) / 2
