@@ -79,7 +79,7 @@ def segmentation_sheet(segmenter: Segmenter, windows: Sequence[Window]) -> Pictu
     """Windows with the outlines of the true and of the detected instances, these with class and score."""
     tiles = []
     for window in windows:
-        tile = np.ascontiguousarray(window.image)
+        tile = window.image.copy()
         for k in range(len(window.centres)):
             _draw_outline(tile, window.instances == k + 1, (0, 0), TRUTH)
         for found in segmenter.detect_reduced(window.image):
