@@ -80,11 +80,15 @@ def bring_down(
 
 
 def _readings(estimate: PartEstimate, parts: Mapping[str, Part], T_base_cam: Array) -> tuple[Reading, ...]:
-    """Of an estimate that names no alternatives its own reading, as probable as its score says."""
+    """What the estimate leaves open, its own reading at most as probable as its score: a poor look tells little.
+
+    An estimate that names no alternatives leaves open its own reading alone.
+    """
     named = [(a.part, a.stable_pose, a.T_cam_part, a.probability) for a in estimate.alternatives]
+    named = named or [(estimate.part, estimate.stable_pose, estimate.T_cam_part, 1.0)]
+    share = min(1.0, estimate.score / max(named[0][3], 1e-9))
     return tuple(
-        Reading(part=parts[name], stable_pose=k, T_base_part=T_base_cam @ T_cam_part, probability=probability)
+        Reading(part=parts[name], stable_pose=k, T_base_part=T_base_cam @ T_cam_part, probability=share * probability)
         for name, k, T_cam_part, probability in named
-        or [(estimate.part, estimate.stable_pose, estimate.T_cam_part, estimate.score)]
         if name in parts
     )

@@ -147,7 +147,7 @@ def test_alternatives_of_an_estimate_are_readings_on_the_board(brick):
     )
     calibration = Calibration(T_base_board=BOARD, T_base_nests={}, q_park=np.zeros(6), board_half_m=(0.1, 0.1))
     seen = bring_down(estimate, {"brick": brick}, T_base_cam, calibration, ControllerConfig())
-    assert [r.probability for r in seen.readings] == [0.7, 0.25]
+    assert [r.probability for r in seen.readings] == pytest.approx([0.3, 0.25 * 0.3 / 0.7])
     np.testing.assert_allclose(seen.readings[0].T_base_part, seen.placed.T_base_part, atol=1e-12)
     np.testing.assert_allclose(seen.readings[1].T_base_part, T_base_part @ T_cam_part, atol=1e-12)
 
