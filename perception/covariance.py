@@ -10,8 +10,8 @@ ray to the camera, because its image stays where it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,11 @@ class NoiseModel:
         """Covariance (..., 3, 3) of (x, y, yaw) from Gauss-Newton's (..., 3, 3) and the shortfall (..., 3)."""
         grown = np.exp(2 * np.minimum(shortfall @ np.array(self.growth), MOST_GROWTH))[..., None, None]
         return grown * (self.scale * planar + np.diag(np.square([self.floor_m, self.floor_m, self.floor_rad])))
+
+    def widened(self, factor: float) -> NoiseModel:
+        """The same with ``factor`` times the covariance of x, y and yaw."""
+        root = float(np.sqrt(factor))
+        return replace(self, scale=self.scale * factor, floor_m=self.floor_m * root, floor_rad=self.floor_rad * root)
 
     def inner(self, planar: Array, shortfall: Array) -> Array:
         """Covariance (6, 6) of (x, y, yaw, height, lean, lean) from Gauss-Newton's (3, 3) and the shortfall (3,)."""
@@ -127,11 +132,39 @@ def normalised_squares(errors: Errors, noise: NoiseModel) -> tuple[Array, Array]
     return flat, flat + rest.sum(axis=1)
 
 
-def fit_noise(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
-    """The noise of greatest likelihood of every part of which there are 20 estimates; how it grows they have in common.
+def joined(errors: Sequence[Errors]) -> Errors:
+    """One after the other."""
+    return Errors(
+        by_cause=np.concatenate([e.by_cause for e in errors]),
+        planar=np.concatenate([e.planar for e in errors]),
+        shortfall=np.concatenate([e.shortfall for e in errors]),
+    )
 
-    Gross outliers are left out: it is for the gate to find them.
+
+def fit_noise(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
+    """The noise of every part of which there are 20 estimates, from errors by part in folds of frames.
+
+    It is that of greatest likelihood, widened as errors ask for in a fold that it was not fitted on: a model that has
+    seen few errors has seen few of the large ones.
     """
+    noise = _fitted(folds)
+    if len(folds) < 2:
+        return noise
+    squares: dict[str, list[Array]] = {}
+    for i, fold in enumerate(folds):
+        others = _fitted([other for k, other in enumerate(folds) if k != i])
+        for part in set(fold) & set(others):
+            squares.setdefault(part, []).append(normalised_squares(fold[part], others[part])[0])
+    wider = {part: max(1.0, float(np.concatenate(found).mean()) / 3.0) for part, found in squares.items()}
+    return {part: model.widened(wider.get(part, 1.0)) for part, model in noise.items()}
+
+
+def _fitted(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
+    """Greatest likelihood; how errors grow with bad contours parts have in common. Gross outliers are left out: it is
+    for the gate to find them.
+    """
+    parts = sorted({part for fold in folds for part in fold})
+    by_part = {part: joined([fold[part] for fold in folds if part in fold]) for part in parts}
     enough = {part: errors for part, errors in by_part.items() if len(errors) >= FEWEST}
     if not enough:
         return {}

@@ -160,7 +160,7 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
         accept_above=threshold,
         temperature=temperature,
         set_mass=mass,
-        noise=fit_noise(errors_by_part(ordered, choice)),
+        noise=fit_noise(_errors_in_folds(findings, choice, config.folds)),
     )
     return weights, _figures(findings, ordered, scores, held_out, weights)
 
@@ -180,27 +180,38 @@ def errors_of(winners: Sequence[Winner]) -> Errors:
 
 
 def errors_by_part(crops: Sequence[CropFindings], choice: dict[str, float]) -> dict[str, Errors]:
-    """Errors of the winners that are usable, by part."""
+    """Errors of the winners that are whole and usable, by part."""
     weights = replace(NEUTRAL, choice=choice)
     out: dict[str, list[Winner]] = {}
     for crop in crops:
         best = winner_of(crop, weights)[0]
-        if crop.errors[best] is not None:
+        if crop.whole and crop.errors[best] is not None:
             out.setdefault(crop.part, []).append((crop, best))
     return {part: errors_of(found) for part, found in sorted(out.items())}
 
 
-def normalised_errors(findings: Sequence[FrameFindings], choice: dict[str, float]) -> dict[str, dict[str, float]]:
-    """How the noise fitted on every other frame holds on the rest: by "part, domain" and by part, the number of
-    estimates and the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
+def _errors_in_folds(
+    findings: Sequence[FrameFindings], choice: dict[str, float], folds: int
+) -> list[dict[str, Errors]]:
+    return [
+        errors_by_part([crop for frame in findings[k::folds] for crop in frame.crops], choice) for k in range(folds)
+    ]
+
+
+def normalised_errors(
+    findings: Sequence[FrameFindings], choice: dict[str, float], folds: int
+) -> dict[str, dict[str, float]]:
+    """How the noise fitted on the other folds holds on each: by "part, domain" and by part, the number of estimates and
+    the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
     """
     seen: dict[str, list[tuple[float, float]]] = {}
-    for half in (0, 1):
-        fitted = fit_noise(errors_by_part([c for f in findings[half::2] for c in f.crops if c.whole], choice))
-        for frame in findings[1 - half :: 2]:
-            for part, errors in errors_by_part([c for c in frame.crops if c.whole], choice).items():
+    errors = _errors_in_folds(findings, choice, folds)
+    for k in range(folds):
+        fitted = fit_noise([fold for i, fold in enumerate(errors) if i != k])
+        for frame in findings[k::folds]:
+            for part, own in errors_by_part(frame.crops, choice).items():
                 if part in fitted:
-                    for pair in zip(*normalised_squares(errors, fitted[part]), strict=True):
+                    for pair in zip(*normalised_squares(own, fitted[part]), strict=True):
                         for name in (f"{part}, {frame.domain}", part):
                             seen.setdefault(name, []).append(pair)
     return {
@@ -283,7 +294,7 @@ def fit_choice(config: ChoiceFitConfig) -> Path:
     findings = collect(config.data, config.out, cache, evidence_config(), config.jobs, config.parts_dir)
     weights, figures = fit_weights(findings, config)
     print("normalised error squared on frames it was not fitted on (3 and 6 when the covariance holds):")
-    for name, row in normalised_errors(findings, weights.choice).items():
+    for name, row in normalised_errors(findings, weights.choice, config.folds).items():
         slack = 1.96 * np.sqrt(np.array([6.0, 12.0]) / row["n"])
         print(
             f"  {name}: {row['planar']:.2f} of 3 +- {slack[0]:.2f}, {row['pose']:.2f} of 6 +- {slack[1]:.2f}, "

@@ -11,6 +11,7 @@ from perception.covariance import (
     NoiseModel,
     fit_noise,
     inner_error,
+    joined,
     normalised_squares,
     pose_covariance,
     shortfall_of,
@@ -87,7 +88,7 @@ def test_fitted_noise_holds_on_other_errors() -> None:
     other = replace(NOISE, floor_m=3e-5, floor_rad=4e-3)
     seen = {"a": draw(300, rng), "b": draw(300, rng, other)}
     seen["a"].by_cause[:3, 0] = 3e-3  # a rim taken for the outline
-    fitted = fit_noise(seen)
+    fitted = fit_noise([seen])
     for part, noise in (("a", NOISE), ("b", other)):
         new = draw(2000, rng, noise)
         flat, whole = normalised_squares(new, fitted[part])
@@ -96,6 +97,18 @@ def test_fitted_noise_holds_on_other_errors() -> None:
         bad = new.shortfall[:, 0] > 0.4
         assert flat[bad].mean() == pytest.approx(3.0, abs=0.6)  # it grows as it should where contours are bad
     assert fitted["a"].height_m == pytest.approx(NOISE.height_m, rel=0.15)
+
+
+def test_noise_is_widened_by_what_other_folds_hold() -> None:
+    rng = np.random.default_rng(3)
+    folds = [{"a": draw(25, rng)} for _ in range(4)]
+    alone, widened = fit_noise([{"a": joined([fold["a"] for fold in folds])}])["a"], fit_noise(folds)["a"]
+    factor = widened.scale / alone.scale
+    assert 1.0 < factor < 2.0
+    assert widened.floor_m == pytest.approx(alone.floor_m * np.sqrt(factor), rel=1e-3)
+    assert widened.height_m == alone.height_m
+    new = draw(1000, rng)
+    assert normalised_squares(new, widened)[0].mean() < normalised_squares(new, alone)[0].mean()
 
 
 def test_a_worse_contour_has_a_larger_covariance_up_to_a_limit() -> None:
@@ -108,7 +121,7 @@ def test_a_worse_contour_has_a_larger_covariance_up_to_a_limit() -> None:
 
 
 def test_few_errors_say_nothing() -> None:
-    assert fit_noise({"a": draw(5, np.random.default_rng(2))}) == {}
+    assert fit_noise([{"a": draw(5, np.random.default_rng(2))}]) == {}
     with pytest.raises(ValueError, match="floor_m"):
         NoiseModel(floor_m=0.0)
     with pytest.raises(ValueError, match="growth"):
