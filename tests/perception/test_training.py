@@ -1,16 +1,17 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from perception import training
+from perception import training, weight_files
 from perception.estimates import PerceptionError
 from perception.train import main, trainer
 from perception.training import TrainingConfig, TrainingResult, learning_rate_at, seeded, train
-from perception.weight_files import load_weights, save_weights, weights_metadata
+from perception.weight_files import load_weights, save_weights, trained_with, weights_metadata
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class FakePart:
 
 @pytest.fixture
 def part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "load_part", lambda name, parts_dir=None: FakePart())
+    monkeypatch.setattr(weight_files, "load_part", lambda name, parts_dir=None: FakePart())
 
 
 def regression(seed: int) -> tuple[nn.Module, training.Step]:
@@ -131,9 +132,25 @@ def test_weights_come_back_with_their_metadata(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("part")
 def test_weights_of_another_mesh_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = weights_file(tmp_path)
-    monkeypatch.setattr(training, "load_part", lambda name, parts_dir=None: FakePart(mesh_hash="other"))
+    monkeypatch.setattr(weight_files, "load_part", lambda name, parts_dir=None: FakePart(mesh_hash="other"))
     with pytest.raises(PerceptionError, match="train again"):
         load_weights(path)
+
+
+@pytest.mark.usefixtures("part")
+def test_weights_know_the_config_that_made_them(tmp_path: Path) -> None:
+    path = weights_file(tmp_path)
+    assert trained_with(path, CONFIG)
+    assert not trained_with(path, replace(CONFIG, seed=4))
+    path.write_bytes(b"nonsense")
+    assert not trained_with(path, CONFIG)
+
+
+def test_curves_become_a_picture(tmp_path: Path) -> None:
+    model, step = regression(3)
+    train("toy", model, step, CONFIG, tmp_path, validate=lambda m: {"training": float(m.training)})
+    picture = cv2.imread(str(tmp_path / "toy.png"))
+    assert picture is not None and picture.shape[0] > 100 and picture.std() > 1.0
 
 
 def test_missing_and_broken_weights_are_named(tmp_path: Path) -> None:
