@@ -31,8 +31,8 @@ from perception.shortlist import Shortlist, ShortlistConfig, shortlist, turned_b
 from perception.sighting import Sighting
 from perception.silhouette import render_view
 
-SAME_PLACE_M = 1.5e-4
-"""Candidates of one reading that lie nearer are no rivals."""
+SAME_PLACE_M = 3e-4
+"""Candidates of one reading that lie nearer are no rivals: either would do for placing a part."""
 LEAST_LOG = -10.0
 LEAST_CLASS = 0.01
 """What the networks' log-probabilities, and the segmenter's probability of a class, count as at least."""

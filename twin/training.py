@@ -24,8 +24,10 @@ LEAST_DATA = 0.25
 TRAINING_DATA = (
     "train_windows",
     "train_windows_filament",
+    "train_windows_hard",
     "train_crops",
     "train_crops_filament",
+    "train_crops_hard",
     "train_crops_none",
     "train_crops_none_filament",
 )
@@ -39,7 +41,7 @@ VALIDATION_DATA = (
 )
 """Recipes of the data; ``seed`` shifts their seeds."""
 
-WITH_PARTS = ("train_crops", "train_crops_filament")
+WITH_PARTS = ("train_crops", "train_crops_filament", "train_crops_hard")
 ALL_CROPS = (*WITH_PARTS, "train_crops_none", "train_crops_none_filament")
 VAL_CROPS = ("val_crops", "val_crops_filament")
 
@@ -58,7 +60,7 @@ LANES: tuple[tuple[Job, ...], ...] = (
     (
         Job(
             network="segmentation",
-            data=("train_windows", "train_windows_filament"),
+            data=("train_windows", "train_windows_filament", "train_windows_hard"),
             val=("val_windows", "val_windows_filament"),
             share=1.0,
         ),
