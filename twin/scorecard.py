@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
 
+from perception.bootstrap import clopper_pearson_lower
 from twin.events import LookedAgain
 from twin.robot import TwinError
 
@@ -63,11 +63,6 @@ class SceneResult:
     retries: int
     looked_again: tuple[LookedAgain, ...] = ()
     wall_s: dict[str, float] = field(default_factory=dict)
-
-
-def success_lower_95(successes: int, trials: int) -> float:
-    """One-sided 95 % Clopper-Pearson lower bound of a success rate."""
-    return float(beta.ppf(0.05, successes, trials - successes + 1)) if successes > 0 else 0.0
 
 
 def summarise(values: Iterable[float]) -> dict[str, float | int | None]:
@@ -131,7 +126,7 @@ def build_scorecard(
             "attempted": sum(p.attempted for p in parts),
             "succeeded": succeeded,
             "success_rate": succeeded / len(parts) if parts else 0.0,
-            "success_lower_95": success_lower_95(succeeded, len(parts)),
+            "success_lower_95": clopper_pearson_lower(succeeded, len(parts)),
             "retries": sum(s.retries for s in scenes),
         },
         "failures": {f: sum(p.failure == f for p in parts) for f in FAILURES},

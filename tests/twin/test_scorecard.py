@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from perception.bootstrap import clopper_pearson_lower
 from twin.events import LookedAgain
 from twin.scorecard import (
     FAILURES,
@@ -10,7 +11,6 @@ from twin.scorecard import (
     PoseError,
     SceneResult,
     build_scorecard,
-    success_lower_95,
     summarise,
     write_json,
 )
@@ -34,10 +34,10 @@ def result(instance: int, *, succeeded: bool, failure: str | None = None, error:
 
 
 def test_clopper_pearson_bounds_agree_with_published_values():
-    assert success_lower_95(30, 30) == pytest.approx(0.05 ** (1 / 30))  # closed form when nothing failed
-    assert success_lower_95(299, 299) >= 0.99 > success_lower_95(297, 297)
-    assert success_lower_95(0, 10) == 0.0
-    assert success_lower_95(8, 10) == pytest.approx(0.4931, abs=1e-4)
+    assert clopper_pearson_lower(30, 30) == pytest.approx(0.05 ** (1 / 30))  # closed form when nothing failed
+    assert clopper_pearson_lower(299, 299) >= 0.99 > clopper_pearson_lower(297, 297)
+    assert clopper_pearson_lower(0, 10) == 0.0
+    assert clopper_pearson_lower(8, 10) == pytest.approx(0.4931, abs=1e-4)
 
 
 def test_a_part_that_was_skipped_counts_against_the_rate():
