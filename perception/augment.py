@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from cad.spatial import Array
+from perception.encoding import encode, encoded
 from perception.shadows import shadow
 
 CROP = 128
@@ -56,13 +57,15 @@ def rectify_warp(centre: ArrayLike, yaw: float, size: int, scale: float = 1.0) -
 def network_input(images: NDArray[np.uint8], rays: NDArray[np.floating]) -> Tensor:
     """Input (B, 5, H, W), channels last in memory, from images (B, H, W, 3) and rays (B, 2).
 
-    Each crop is normalised by its own mean and standard deviation; two constant channels hold the ray to its centre.
+    Each crop is encoded and normalised by its own mean and standard deviation; two constant channels hold the ray to
+    its centre.
     """
     x = np.empty((*images.shape[:3], 5), dtype=np.float32)
     for i, image in enumerate(images):
-        mean, deviation = _moments(image)
+        c = encoded(image)
+        mean, deviation = _moments(c)
         gain = 1.0 / (deviation + 8.0)
-        x[i] = _to_planes(image.astype(np.float32), gain * np.eye(3), np.full(3, -gain * mean), rays[i])
+        x[i] = _to_planes(c, gain * np.eye(3), np.full(3, -gain * mean), rays[i])
     return torch.from_numpy(x).permute(0, 3, 1, 2)
 
 
@@ -83,12 +86,13 @@ class Photometric:
         ramps[1] = np.linspace(-1, 1, height)[:, None, None]
         x = np.empty((batch, height, width, 5), dtype=np.float32)
         for i, image in enumerate(images):
-            mean, deviation = _moments(image)
-            c = image.astype(np.float32)
+            if rng.random() < SHADOWED:
+                c = encode(np.round(image * shadow(height, width, rng)[..., None]))
+            else:
+                c = encoded(image)
+            mean, deviation = _moments(c)
             for ramp in ramps:
                 c = cv2.scaleAdd(ramp, float(rng.normal(0.0, 0.15)) * deviation, c)
-            if rng.random() < SHADOWED:
-                c *= shadow(height, width, rng)[..., None]
             if rng.random() < 0.5:
                 start = int(rng.integers(len(self.noise) - c.size))
                 noise = self.noise[start : start + c.size].reshape(c.shape)
@@ -109,7 +113,7 @@ def _colour_mix(rng: np.random.Generator) -> Array:
     return (-1.0 if rng.random() < 0.1 else 1.0) * tint @ grey
 
 
-def _moments(image: NDArray[np.uint8]) -> tuple[float, float]:
+def _moments(image: NDArray[np.float32]) -> tuple[float, float]:
     """Mean and standard deviation over all pixels and channels."""
     mean, deviation = cv2.meanStdDev(image)
     return float(mean.mean()), float(np.sqrt((deviation**2).mean() + mean.var()))

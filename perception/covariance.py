@@ -2,16 +2,16 @@
 
 An error has six parts, one for each thing that goes wrong on its own. In the table's plane, x, y and yaw of the
 contour: the covariance of Gauss-Newton, scaled, since neighbouring profiles are not independent, and a floor, since
-chamfers and shadows pull edges the same way. Both grow where the contour matches the image badly: a contour that clings
-to shadows or parallel edges shows by that, not by Gauss-Newton. Off the plane, what a resting pose takes as exact: the
-height of the table below the part, read from the tags, and the part's lean on it. A wrong height moves a part along the
-ray to the camera, because its image stays where it is.
+chamfers and shadows pull edges the same way. Both grow where the contour matches the image badly and where the gate has
+its doubts: a contour that clings to shadows or parallel edges shows by that, not by Gauss-Newton. Off the plane, what a
+resting pose takes as exact: the height of the table below the part, read from the tags, and the part's lean on it. A
+wrong height moves a part along the ray to the camera, because its image stays where it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,11 @@ GROSS = 300.0
 FEWEST = 20
 """Estimates of a part that are needed to fit its noise."""
 QUALITIES = ("matched_fraction", "correlation", "explained")
-"""Scores of a contour, 1 for a perfect one, whose shortfall makes errors larger."""
+"""Scores of a contour, 1 for a perfect one, whose shortfall makes errors larger; so does the gate's doubt."""
+NO_DOUBT_NATS = 6.0
+"""Log-odds of being right from which there is no doubt; there is as much as 1 at even odds."""
+LEAST_MOST_MEAN = (0.3, 12.0)
+"""Limits of the mean normalised error squared, of three degrees, that the noise is scaled by."""
 MOST_GROWTH = 4.0
 """Natural logarithm of the most that a bad contour makes of an error's standard deviation."""
 
@@ -35,9 +39,9 @@ class NoiseModel:
     """Standard deviations that the contour's own covariance does not know of.
 
     ``scale`` multiplies the covariance of Gauss-Newton; ``floor_m`` (x and y) and ``floor_rad`` (yaw) are added to it
-    in squares. Both are for a perfect contour; for each of the ``QUALITIES`` ``growth`` says how much the logarithm of
-    the standard deviation grows with what the contour lacks of it. ``height_m`` is that of the table's height at the
-    part, ``lean_rad`` that of the part's lean.
+    in squares. Both are for a perfect contour beyond doubt; for each of the ``QUALITIES``, and for the doubt,
+    ``growth`` says how much the logarithm of the standard deviation grows with the shortfall. ``height_m`` is that of
+    the table's height at the part, ``lean_rad`` that of the part's lean.
     """
 
     scale: float = 4.0
@@ -45,17 +49,17 @@ class NoiseModel:
     floor_rad: float = float(np.radians(0.05))
     height_m: float = 3e-5
     lean_rad: float = float(np.radians(0.15))
-    growth: tuple[float, ...] = (0.0,) * len(QUALITIES)
+    growth: tuple[float, ...] = (0.0,) * (len(QUALITIES) + 1)
 
     def __post_init__(self) -> None:
         for name in ("scale", "floor_m", "floor_rad", "height_m", "lean_rad"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be above 0")
-        if len(self.growth) != len(QUALITIES):
-            raise ValueError(f"growth = {self.growth}: must have a number for each of {', '.join(QUALITIES)}")
+        if len(self.growth) != len(QUALITIES) + 1:
+            raise ValueError(f"growth = {self.growth}: must have a number for each of {', '.join(QUALITIES)}, doubt")
 
     def flat(self, planar: Array, shortfall: Array) -> Array:
-        """Covariance (..., 3, 3) of (x, y, yaw) from Gauss-Newton's (..., 3, 3) and the shortfall (..., 3)."""
+        """Covariance (..., 3, 3) of (x, y, yaw) from Gauss-Newton's (..., 3, 3) and the shortfall (..., 4)."""
         grown = np.exp(2 * np.minimum(shortfall @ np.array(self.growth), MOST_GROWTH))[..., None, None]
         return grown * (self.scale * planar + np.diag(np.square([self.floor_m, self.floor_m, self.floor_rad])))
 
@@ -65,15 +69,17 @@ class NoiseModel:
         return replace(self, scale=self.scale * factor, floor_m=self.floor_m * root, floor_rad=self.floor_rad * root)
 
     def inner(self, planar: Array, shortfall: Array) -> Array:
-        """Covariance (6, 6) of (x, y, yaw, height, lean, lean) from Gauss-Newton's (3, 3) and the shortfall (3,)."""
+        """Covariance (6, 6) of (x, y, yaw, height, lean, lean) from Gauss-Newton's (3, 3) and the shortfall (4,)."""
         out = np.diag(np.square([0.0, 0.0, 0.0, self.height_m, self.lean_rad, self.lean_rad]))
         out[:3, :3] = self.flat(planar, shortfall)
         return out
 
 
-def shortfall_of(contour: Refinement) -> Array:
-    """What (3,) a contour lacks of a perfect one in each of the ``QUALITIES``."""
-    return 1.0 - np.array([getattr(contour, name) for name in QUALITIES])
+def shortfall_of(qualities: Sequence[float], probability: float) -> Array:
+    """What (4,) a contour lacks of a perfect one in each of the ``QUALITIES``, and the doubt that it is right."""
+    p = float(np.clip(probability, 1e-6, 1 - 1e-6))
+    doubt = np.clip(1.0 - np.log(p / (1.0 - p)) / NO_DOUBT_NATS, 0.0, 2.0)
+    return np.append(1.0 - np.asarray(qualities, np.float64), doubt)
 
 
 def pose_jacobian(T_cam_table: Array, T_cam_part: Array, x: float, y: float) -> Array:
@@ -92,10 +98,15 @@ def pose_jacobian(T_cam_table: Array, T_cam_part: Array, x: float, y: float) -> 
     return J
 
 
-def pose_covariance(contour: Refinement, noise: NoiseModel, T_cam_table: Array, T_cam_part: Array) -> Array:
-    """Covariance (6, 6) of (translation m, rotation vector rad) in ``cam`` of a part that a contour was laid on."""
+def pose_covariance(
+    contour: Refinement, probability: float, noise: NoiseModel, T_cam_table: Array, T_cam_part: Array
+) -> Array:
+    """Covariance (6, 6) of (translation m, rotation vector rad) in ``cam`` of a part that a contour was laid on, which
+    is right with a ``probability``.
+    """
     J = pose_jacobian(T_cam_table, T_cam_part, contour.x, contour.y)
-    return J @ noise.inner(contour.covariance, shortfall_of(contour)) @ J.T
+    shortfall = shortfall_of([getattr(contour, name) for name in QUALITIES], probability)
+    return J @ noise.inner(contour.covariance, shortfall) @ J.T
 
 
 def inner_error(T_cam_part_true: Array, T_cam_part: Array, T_cam_table: Array, x: float, y: float) -> Array:
@@ -108,19 +119,20 @@ def inner_error(T_cam_part_true: Array, T_cam_part: Array, T_cam_table: Array, x
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Errors:
     """Errors of N estimates ``by_cause`` (N, 6) as from :func:`inner_error`, Gauss-Newton's covariances ``planar``
-    (N, 3, 3) and the shortfalls of their contours (N, 3).
+    (N, 3, 3), the shortfalls of their contours (N, 4) and which are accepted (N,).
     """
 
     by_cause: Array
     planar: Array
     shortfall: Array
+    accepted: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.by_cause)
 
     def take(self, rows: NDArray[np.bool_]) -> Errors:
         """Some of them."""
-        return Errors(by_cause=self.by_cause[rows], planar=self.planar[rows], shortfall=self.shortfall[rows])
+        return Errors(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
 def normalised_squares(errors: Errors, noise: NoiseModel) -> tuple[Array, Array]:
@@ -134,18 +146,15 @@ def normalised_squares(errors: Errors, noise: NoiseModel) -> tuple[Array, Array]
 
 def joined(errors: Sequence[Errors]) -> Errors:
     """One after the other."""
-    return Errors(
-        by_cause=np.concatenate([e.by_cause for e in errors]),
-        planar=np.concatenate([e.planar for e in errors]),
-        shortfall=np.concatenate([e.shortfall for e in errors]),
-    )
+    return Errors(**{field.name: np.concatenate([getattr(e, field.name) for e in errors]) for field in fields(Errors)})
 
 
 def fit_noise(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
     """The noise of every part of which there are 20 estimates, from errors by part in folds of frames.
 
-    It is that of greatest likelihood, widened as errors ask for in a fold that it was not fitted on: a model that has
-    seen few errors has seen few of the large ones.
+    It is that of greatest likelihood, widened or narrowed to what the accepted ones show in a fold that it was not
+    fitted on: a model that has seen few errors has seen few of the large ones, and one of large errors too is too wide
+    for those that are acted upon.
     """
     noise = _fitted(folds)
     if len(folds) < 2:
@@ -154,9 +163,15 @@ def fit_noise(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
     for i, fold in enumerate(folds):
         others = _fitted([other for k, other in enumerate(folds) if k != i])
         for part in set(fold) & set(others):
-            squares.setdefault(part, []).append(normalised_squares(fold[part], others[part])[0])
-    wider = {part: max(1.0, float(np.concatenate(found).mean()) / 3.0) for part, found in squares.items()}
-    return {part: model.widened(wider.get(part, 1.0)) for part, model in noise.items()}
+            accepted = fold[part].take(fold[part].accepted)
+            squares.setdefault(part, []).append(normalised_squares(accepted, others[part])[0])
+    factor = {part: _mean_of(np.concatenate(found)) / 3.0 for part, found in squares.items()}
+    return {part: model.widened(factor.get(part, 1.0)) for part, model in noise.items()}
+
+
+def _mean_of(squares: Array) -> float:
+    """The mean of normalised errors squared of 3 degrees of freedom, 3 of too few."""
+    return float(np.clip(squares.mean(), *LEAST_MOST_MEAN)) if len(squares) >= FEWEST else 3.0
 
 
 def _fitted(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
@@ -187,6 +202,12 @@ def _typical(errors: Errors) -> NoiseModel:
     )
 
 
+def _off_plane(errors: Errors) -> Array:
+    """Height and lean (N, 3) of the accepted ones, of all when these are few."""
+    accepted = errors.take(errors.accepted) if np.count_nonzero(errors.accepted) >= FEWEST else errors
+    return accepted.by_cause[:, 3:]
+
+
 _UNIT = np.array([1e-5, 1e-5, 1e-3])  # so that all is near one
 _START = np.log([100.0, 1.0, 1.0])
 
@@ -194,6 +215,7 @@ _START = np.log([100.0, 1.0, 1.0])
 def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
     parts = list(by_part)
     count = sum(len(errors) for errors in by_part.values())
+    upright = {part: _off_plane(errors) for part, errors in by_part.items()}
 
     def unpacked(values: Array) -> dict[str, NoiseModel]:
         growth = tuple(values[3 * len(parts) :].tolist())
@@ -203,8 +225,8 @@ def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
                 scale=float(np.exp(scale)),
                 floor_m=float(np.exp(floor) * _UNIT[0]),
                 floor_rad=float(np.exp(floor_yaw) * _UNIT[2]),
-                height_m=float(np.sqrt(np.mean(by_part[part].by_cause[:, 3] ** 2)) + 1e-7),
-                lean_rad=float(np.sqrt(np.mean(by_part[part].by_cause[:, 4:] ** 2)) + 1e-6),
+                height_m=float(np.sqrt(np.mean(upright[part][:, 0] ** 2)) + 1e-7),
+                lean_rad=float(np.sqrt(np.mean(upright[part][:, 1:] ** 2)) + 1e-6),
                 growth=growth,
             )
             for part, (scale, floor, floor_yaw) in zip(parts, logs, strict=True)
@@ -221,6 +243,7 @@ def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
         # A weak pull to the start decides where scale, floor and growth can stand for each other.
         return total + 1e-3 * float(np.sum((values - first) ** 2))
 
-    first = np.append(np.tile(_START, len(parts)), np.zeros(len(QUALITIES)))
-    bounds = [(value - 8.0, value + 8.0) for value in first[: 3 * len(parts)]] + [(0.0, 10.0)] * len(QUALITIES)
+    n_growth = len(QUALITIES) + 1
+    first = np.append(np.tile(_START, len(parts)), np.zeros(n_growth))
+    bounds = [(value - 8.0, value + 8.0) for value in first[: 3 * len(parts)]] + [(0.0, 10.0)] * n_growth
     return unpacked(minimize(loss, first, method="L-BFGS-B", bounds=bounds).x)

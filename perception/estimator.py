@@ -178,7 +178,9 @@ class LearnedEstimator:
             stable_pose=winner.face.stable_pose.index,
             score=pose.probability,
             verdict=self._verdict(pose, len(alternatives)),
-            covariance=pose_covariance(r, self.solver.weights.noise_of(winner.face.part.name), T_cam_table, T_cam_part),
+            covariance=pose_covariance(
+                r, pose.probability, self.solver.weights.noise_of(winner.face.part.name), T_cam_table, T_cam_part
+            ),
             raw_T_cam_part=_raw_pose(winner, intrinsics.downscaled(HALF)),
             mask=mask,
             mask_origin=origin,

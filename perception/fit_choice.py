@@ -28,7 +28,7 @@ from perception.choice_models import (
     fit_temperature,
     wrong_share_bound,
 )
-from perception.covariance import QUALITIES, Errors, fit_noise, normalised_squares
+from perception.covariance import QUALITIES, Errors, fit_noise, normalised_squares, shortfall_of
 from perception.crop_poses import SAME_PLACE_M
 from perception.estimates import PerceptionError
 from perception.estimator import CHOICE_FILE, EstimatorConfig
@@ -160,57 +160,52 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
         accept_above=threshold,
         temperature=temperature,
         set_mass=mass,
-        noise=fit_noise(_errors_in_folds(findings, choice, config.folds)),
     )
+    weights = replace(weights, noise=fit_noise(_errors_in_folds(findings, weights, config.folds)))
     return weights, _figures(findings, ordered, scores, held_out, weights)
 
 
-Winner = tuple[CropFindings, int]
-"""A crop and the index of its winner."""
-
-
-def errors_of(winners: Sequence[Winner]) -> Errors:
-    """Errors of winners that are usable."""
-    columns = [FEATURES.index(name) for name in QUALITIES]
-    return Errors(
-        by_cause=np.array([crop.errors[best] for crop, best in winners], np.float64).reshape(-1, 6),
-        planar=np.array([crop.planar[best] for crop, best in winners], np.float64).reshape(-1, 3, 3),
-        shortfall=1.0 - np.array([crop.evidence[best] for crop, best in winners])[:, columns],
-    )
-
-
-def errors_by_part(crops: Sequence[CropFindings], choice: dict[str, float]) -> dict[str, Errors]:
+def errors_by_part(crops: Sequence[CropFindings], weights: ChoiceWeights) -> dict[str, Errors]:
     """Errors of the winners that are whole and usable, by part."""
-    weights = replace(NEUTRAL, choice=choice)
-    out: dict[str, list[Winner]] = {}
+    columns = [FEATURES.index(name) for name in QUALITIES]
+    rows: dict[str, list[tuple[list[float], list[list[float]], Array, bool]]] = {}
     for crop in crops:
-        best = winner_of(crop, weights)[0]
-        if crop.whole and crop.errors[best] is not None:
-            out.setdefault(crop.part, []).append((crop, best))
-    return {part: errors_of(found) for part, found in sorted(out.items())}
+        best, _, gate = winner_of(crop, weights)
+        error = crop.errors[best]
+        if not crop.whole or error is None:
+            continue
+        p = float(weights.probability_right(gate))
+        shortfall = shortfall_of([crop.evidence[best][k] for k in columns], p)
+        rows.setdefault(crop.part, []).append((error, crop.planar[best], shortfall, p > weights.accept_above))
+    return {
+        part: Errors(**{name: np.array(column) for name, column in zip(_ERRORS, zip(*found, strict=True), strict=True)})
+        for part, found in sorted(rows.items())
+    }
 
 
-def _errors_in_folds(
-    findings: Sequence[FrameFindings], choice: dict[str, float], folds: int
-) -> list[dict[str, Errors]]:
+_ERRORS = ("by_cause", "planar", "shortfall", "accepted")
+
+
+def _errors_in_folds(findings: Sequence[FrameFindings], weights: ChoiceWeights, folds: int) -> list[dict[str, Errors]]:
     return [
-        errors_by_part([crop for frame in findings[k::folds] for crop in frame.crops], choice) for k in range(folds)
+        errors_by_part([crop for frame in findings[k::folds] for crop in frame.crops], weights) for k in range(folds)
     ]
 
 
 def normalised_errors(
-    findings: Sequence[FrameFindings], choice: dict[str, float], folds: int
+    findings: Sequence[FrameFindings], weights: ChoiceWeights, folds: int
 ) -> dict[str, dict[str, float]]:
-    """How the noise fitted on the other folds holds on each: by "part, domain" and by part, the number of estimates and
-    the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
+    """How the noise fitted on the other folds holds on the accepted ones of each: by "part, domain" and by part, the
+    number of estimates and the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
     """
     seen: dict[str, list[tuple[float, float]]] = {}
-    errors = _errors_in_folds(findings, choice, folds)
+    errors = _errors_in_folds(findings, weights, folds)
     for k in range(folds):
         fitted = fit_noise([fold for i, fold in enumerate(errors) if i != k])
         for frame in findings[k::folds]:
-            for part, own in errors_by_part(frame.crops, choice).items():
-                if part in fitted:
+            for part, every in errors_by_part(frame.crops, weights).items():
+                own = every.take(every.accepted)
+                if part in fitted and len(own):
                     for pair in zip(*normalised_squares(own, fitted[part]), strict=True):
                         for name in (f"{part}, {frame.domain}", part):
                             seen.setdefault(name, []).append(pair)
@@ -294,7 +289,7 @@ def fit_choice(config: ChoiceFitConfig) -> Path:
     findings = collect(config.data, config.out, cache, evidence_config(), config.jobs, config.parts_dir)
     weights, figures = fit_weights(findings, config)
     print("normalised error squared on frames it was not fitted on (3 and 6 when the covariance holds):")
-    for name, row in normalised_errors(findings, weights.choice, config.folds).items():
+    for name, row in normalised_errors(findings, weights, config.folds).items():
         slack = 1.96 * np.sqrt(np.array([6.0, 12.0]) / row["n"])
         print(
             f"  {name}: {row['planar']:.2f} of 3 +- {slack[0]:.2f}, {row['pose']:.2f} of 6 +- {slack[1]:.2f}, "

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cad.spatial import Array
+from perception.encoding import encoded
 from perception.estimates import Frame, PerceptionError
 from perception.layers import default_device
 from perception.standard_view import reduced
@@ -37,7 +38,7 @@ OFFSET_SCALE_PX = 8.0
 NORMALISATION_WINDOW_PX = 97
 """Side of the square, about 26 mm, over which brightness and contrast are normalised."""
 CONTRAST_FLOOR = 8.0
-"""Added to the local standard deviation in grey levels, so that noise on flat areas is not blown up."""
+"""Added to the local standard deviation in encoded levels, so that noise on flat areas is not blown up."""
 WEIGHTS = "segmentation.safetensors"
 
 
@@ -60,13 +61,18 @@ class Detection:
 
 @dataclass(frozen=True, kw_only=True)
 class DecodeConfig:
-    """Thresholds that turn the network's outputs into instances; lengths in reduced pixels."""
+    """Thresholds that turn the network's outputs into instances; lengths in reduced pixels.
 
-    peak: float = 0.3
+    They are low: what is found is looked at again by the crop networks, which know "not a part"; what is missed is
+    lost. On validation frames ``score`` 0.15 finds 98.8 % of the parts and 1.2 of something else a frame, 0.3 finds
+    97.4 % and 0.7.
+    """
+
+    peak: float = 0.1
     mask: float = 0.5
-    score: float = 0.3
+    score: float = 0.15
     vote_radius_px: float = 12.0
-    min_area_px: int = 30
+    min_area_px: int = 20
     max_peaks: int = 100
 
     def __post_init__(self) -> None:
@@ -76,8 +82,8 @@ class DecodeConfig:
 
 
 def normalise(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """An RGB image (H, W, 3) minus its local mean brightness, over its local contrast."""
-    rgb = image.astype(np.float32)
+    """An RGB image (H, W, 3), encoded, minus its local mean brightness, over its local contrast."""
+    rgb = encoded(image)
     gray = rgb.mean(axis=2)
     side = (NORMALISATION_WINDOW_PX, NORMALISATION_WINDOW_PX)
     mean = cv2.blur(gray, side, borderType=cv2.BORDER_REFLECT_101)

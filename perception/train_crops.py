@@ -26,7 +26,7 @@ from perception.faces import FaceTable
 from perception.labels import CropLabels, label_crops, take_crops
 from perception.pvnet import GRID, PVNet, pvnet_loss, sample_cells
 from perception.score_crops import score_classifier, score_keypoints, score_verifier
-from perception.training import Step, TrainingConfig, TrainingResult, seeded, train
+from perception.training import Step, TrainingConfig, TrainingResult, evenly_chosen, seeded, train
 from perception.training_pictures import classifier_sheet, keypoints_sheet, save_picture
 from perception.verifier import PairSampler, Verifier, listwise, verifier_loss
 from perception.weight_files import load_weights, save_weights, weights_metadata
@@ -39,7 +39,7 @@ class CropTrainingConfig(TrainingConfig):
     """Folders with the crops, besides how to train. ``validate`` crops of ``val`` are scored now and then.
 
     ``parts`` are those that the crops show, the built-in ones by default. ``start`` names a folder with earlier weights
-    of the same network and faces to go on from.
+    of the same network and faces to go on from. Of ``data`` no more than ``images`` are learned from, evenly chosen.
     """
 
     data: tuple[Path, ...]
@@ -48,6 +48,7 @@ class CropTrainingConfig(TrainingConfig):
     parts: tuple[str, ...] = ()
     parts_dir: Path | None = None
     start: Path | None = None
+    images: int | None = None
     validate: int = 400
 
     @cached_property
@@ -204,6 +205,8 @@ def train_on_crops(
     """
     table = config.table
     crops, val = load_crops(*config.data), load_crops(*config.val)
+    if config.images is not None:
+        crops = take_crops(crops, evenly_chosen(len(crops), config.images))
     labels, val_labels = label_crops(table, crops), label_crops(table, val)
     some = np.arange(0, len(val), max(1, len(val) // config.validate))
     some_val, some_labels = take_crops(val, some), val_labels.take(some)

@@ -34,7 +34,7 @@ from perception.segmentation import (
     normalise,
     reduced_autocast,
 )
-from perception.training import Losses, TrainingConfig, seeded, train
+from perception.training import Losses, TrainingConfig, evenly_chosen, seeded, train
 from perception.training_pictures import save_picture, segmentation_sheet
 from perception.weight_files import load_weights, save_weights, weights_metadata
 from perception.windows import MIN_VISIBLE_PX, Window, Windows, cut, flip, paste, recolour, warp
@@ -42,8 +42,6 @@ from perception.windows import MIN_VISIBLE_PX, Window, Windows, cut, flip, paste
 NO_CLASS = -100
 HEAT_SIGMA_CELLS = 1.1
 PICTURED = 6
-ALLOWED_LOSS = 0.005
-"""Share of the parts whose loss is worth fewer false detections."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +49,9 @@ class SegmentationTraining(TrainingConfig):
     """Where the windows are and how they are varied; the rest as in ``TrainingConfig``.
 
     ``parts`` are those that the windows show, the built-in ones by default. ``start`` names a folder with earlier
-    weights to go on from. ``size`` is the side of the squares cut from the windows, a multiple of 16, ``warp`` the
-    share of windows that are turned and scaled, ``paste`` the mean number of parts of other windows that are tried in
-    free places of one.
+    weights to go on from. Of ``data`` no more than ``images`` are learned from, evenly chosen. ``size`` is the side of
+    the squares cut from the windows, a multiple of 16, ``warp`` the share of windows that are turned and scaled,
+    ``paste`` the mean number of parts of other windows that are tried in free places of one.
     """
 
     data: tuple[Path, ...]
@@ -62,6 +60,7 @@ class SegmentationTraining(TrainingConfig):
     parts: tuple[str, ...] = ()
     parts_dir: Path | None = None
     start: Path | None = None
+    images: int | None = None
     minutes: float = 16.0
     batch: int = 12
     size: int = 208
@@ -115,11 +114,13 @@ def targets_of(window: Window) -> dict[str, NDArray]:
     }
 
 
-def example(windows: Windows, rng: np.random.Generator, config: SegmentationTraining) -> Window:
-    """A randomly chosen and varied window."""
-    window = windows[int(rng.integers(len(windows)))]
+def example(
+    windows: Windows, chosen: NDArray[np.int64], rng: np.random.Generator, config: SegmentationTraining
+) -> Window:
+    """A randomly drawn and varied window of those ``chosen`` (M,)."""
+    window = windows[int(rng.choice(chosen))]
     for _ in range(rng.poisson(config.paste)):
-        window = paste(window, windows[int(rng.integers(len(windows)))], rng)
+        window = paste(window, windows[int(rng.choice(chosen))], rng)
     if rng.random() < config.warp:
         window = warp(window, rng)
     window = flip(cut(window, config.size, rng), rng)
@@ -220,11 +221,12 @@ def figures_of(examined: Sequence[Examined], min_score: float = 0.0) -> dict[str
 
 
 def train_segmentation(config: SegmentationTraining) -> None:
-    """Train, pick the score threshold on the validation windows, and keep the weights with their figures."""
+    """Train, measure on all validation windows, and keep the weights with their figures."""
     cv2.setNumThreads(config.threads)
     names = config.parts or BUILT_IN
     parts = [load_part(name, config.parts_dir) for name in names]
     training, validation = (Windows(*map(load_windows, paths), parts=parts) for paths in (config.data, config.val))
+    chosen = evenly_chosen(len(training), config.images)
     device = default_device()
     with seeded(config.seed):
         net = SegmentationNet(len(parts)).to(device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -235,7 +237,7 @@ def train_segmentation(config: SegmentationTraining) -> None:
         minutes_before = earlier["minutes"] + earlier.get("minutes_before_start", 0.0)
 
     def step(rng: np.random.Generator) -> Losses:
-        images, targets = batch_of([example(training, rng, config) for _ in range(config.batch)], device)
+        images, targets = batch_of([example(training, chosen, rng, config) for _ in range(config.batch)], device)
         with reduced_autocast(device):
             outputs = net(images)
         return losses(outputs, targets)
@@ -251,26 +253,13 @@ def train_segmentation(config: SegmentationTraining) -> None:
 
     result = train("segmentation", net, step, config, config.out, validate=validate)
     net.load_state_dict(result.state_dict)
-    decode, figures = best_threshold(net, names, validation)
+    segmenter = Segmenter(net, names, DecodeConfig())
+    figures = figures_of(examine(segmenter, (validation[i] for i in range(len(validation)))))
     data = {path.name: manifest_hash(path) for path in (*config.data, *config.val)}
     metadata = weights_metadata(names, config, result, data, figures, config.parts_dir) | {
-        "decode": asdict(decode),
+        "decode": asdict(segmenter.config),
         "net": net.shape,
     }
     metadata["minutes_before_start"] = minutes_before
     save_weights(config.out / WEIGHTS, result.state_dict, metadata)
     print("  ".join(f"{key} {value:.4f}" for key, value in figures.items()))
-
-
-def best_threshold(
-    net: SegmentationNet, names: Sequence[str], validation: Windows
-) -> tuple[DecodeConfig, dict[str, float]]:
-    """The highest score threshold that costs next to no recall at overlap 0.5, and the figures there.
-
-    What is found is looked at again by the crop networks, which know "not a part"; what is missed is lost.
-    """
-    examined = examine(Segmenter(net, names, DecodeConfig(score=0.05)), (validation[i] for i in range(len(validation))))
-    tried = {score: figures_of(examined, score) for score in np.arange(0.1, 0.8, 0.05).round(2).tolist()}
-    enough = max(figures["recall50"] for figures in tried.values()) - ALLOWED_LOSS
-    best = max(score for score, figures in tried.items() if figures["recall50"] >= enough)
-    return DecodeConfig(score=best), tried[best]

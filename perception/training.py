@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from perception.estimates import PerceptionError
@@ -78,6 +79,18 @@ def seeded(seed: int) -> Iterator[None]:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         yield
+
+
+def evenly_chosen(n: int, most: int | None) -> NDArray[np.int64]:
+    """Indices of ``most`` of ``n`` examples, evenly spread; of all when there are no more or no limit.
+
+    Raises PerceptionError when none are asked for.
+    """
+    if most is None or most >= n:
+        return np.arange(n)
+    if most < 1:
+        raise PerceptionError(f"{most} images to learn from: there must be at least 1 of the {n}")
+    return np.round(np.linspace(0, n - 1, most)).astype(np.int64)
 
 
 def learning_rate_at(config: TrainingConfig, step: int, progress: float) -> float:

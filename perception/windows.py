@@ -20,6 +20,9 @@ MIN_VISIBLE_PX = 40
 SHADOWED = 0.3
 """Share of the examples over which something casts a shadow from outside."""
 
+PASTED_APART_PX = (0, 1, 3)
+"""How far a pasted part may be from the others, each as often: parts that touch are to be told apart."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -148,7 +151,8 @@ def paste(window: Window, other: Window, rng: np.random.Generator, margin: int =
     j = int(rng.integers(0, window.instances.shape[0] - own.shape[0] + 1))
     i = int(rng.integers(0, window.instances.shape[1] - own.shape[1] + 1))
     place = np.s_[j : j + own.shape[0], i : i + own.shape[1]]
-    reach = cv2.dilate(own.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    apart = int(rng.choice(PASTED_APART_PX))
+    reach = cv2.dilate(own.astype(np.uint8), np.ones((2 * apart + 1,) * 2, np.uint8)) > 0
     if window.instances[place][reach].any():
         return window
     gray = patch.mean(axis=2)

@@ -38,12 +38,14 @@ VALIDATION_DATA = (
     "val_crops_filament",
     "val_frames",
     "val_frames_filament",
+    "val_frames_hard",
 )
 """Recipes of the data; ``seed`` shifts their seeds."""
 
 WITH_PARTS = ("train_crops", "train_crops_filament", "train_crops_hard")
 ALL_CROPS = (*WITH_PARTS, "train_crops_none", "train_crops_none_filament")
 VAL_CROPS = ("val_crops", "val_crops_filament")
+VAL_FRAMES = ("val_frames", "val_frames_filament", "val_frames_hard")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +133,7 @@ def train_all(plan: TrainPlan) -> list[Path]:
     choice = trainer("choice")
     choice(
         get_type_hints(choice)["config"](
-            data=tuple(plan.data / name for name in ("val_frames", "val_frames_filament")),
+            data=tuple(plan.data / name for name in VAL_FRAMES),
             out=plan.weights,
             parts_dir=plan.parts_dir,
             jobs=plan.threads,

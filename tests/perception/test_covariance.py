@@ -7,6 +7,7 @@ from cad.parts import planar
 from cad.spatial import rotation_from_rotvec, rotation_x, transform
 from perception.contour import Refinement
 from perception.covariance import (
+    QUALITIES,
     Errors,
     NoiseModel,
     fit_noise,
@@ -31,7 +32,12 @@ CONTOUR = Refinement(
     correlation=0.9,
     explained=0.95,
 )
-NOISE = NoiseModel(scale=2.0, floor_m=1e-5, floor_rad=1e-3, height_m=4e-5, lean_rad=3e-3, growth=(2.0, 0.5, 4.0))
+NOISE = NoiseModel(scale=2.0, floor_m=1e-5, floor_rad=1e-3, height_m=4e-5, lean_rad=3e-3, growth=(2.0, 0.5, 4.0, 0.7))
+PROBABILITY = 0.99
+
+
+def shortfall(contour: Refinement, probability: float = PROBABILITY) -> np.ndarray:
+    return shortfall_of([getattr(contour, name) for name in QUALITIES], probability)
 
 
 def pose(x: float, y: float, yaw: float, height: float = 0.0, lean: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
@@ -45,8 +51,8 @@ def pose(x: float, y: float, yaw: float, height: float = 0.0, lean: tuple[float,
 
 def test_covariance_is_that_of_sampled_poses() -> None:
     rng, T = np.random.default_rng(0), pose(*AT)
-    stated = pose_covariance(CONTOUR, NOISE, T_CAM_TABLE, T)
-    flat = NOISE.flat(GAUSS_NEWTON, shortfall_of(CONTOUR))
+    stated = pose_covariance(CONTOUR, PROBABILITY, NOISE, T_CAM_TABLE, T)
+    flat = NOISE.flat(GAUSS_NEWTON, shortfall(CONTOUR))
     squares = []
     for x, y, yaw in rng.multivariate_normal(AT, flat, 3000):
         lean = (rng.normal(0, NOISE.lean_rad), rng.normal(0, NOISE.lean_rad))
@@ -69,7 +75,7 @@ def test_each_cause_is_found_again_in_the_error() -> None:
 
 def test_a_higher_table_moves_a_part_along_its_ray_alone() -> None:
     tight = replace(NOISE, scale=1e-6, floor_m=1e-9, floor_rad=1e-9, lean_rad=1e-9)
-    C = pose_covariance(CONTOUR, tight, T_CAM_TABLE, pose(*AT))
+    C = pose_covariance(CONTOUR, PROBABILITY, tight, T_CAM_TABLE, pose(*AT))
     foot = T_CAM_TABLE @ [AT[0], AT[1], 0.0, 1.0]
     ray = foot[:3] / np.linalg.norm(foot[:3])
     across = np.eye(3) - np.outer(ray, ray)
@@ -78,9 +84,9 @@ def test_a_higher_table_moves_a_part_along_its_ray_alone() -> None:
 
 def draw(n: int, rng: np.random.Generator, noise: NoiseModel = NOISE) -> Errors:
     contours = GAUSS_NEWTON * rng.uniform(0.3, 3.0, n)[:, None, None]
-    shortfall = rng.uniform(0.0, [0.7, 0.4, 0.3], (n, 3))
-    errors = [rng.multivariate_normal(np.zeros(6), noise.inner(C, s)) for C, s in zip(contours, shortfall, strict=True)]
-    return Errors(by_cause=np.array(errors), planar=contours, shortfall=shortfall)
+    lacks = rng.uniform(0.0, [0.7, 0.4, 0.3, 1.2], (n, 4))
+    errors = [rng.multivariate_normal(np.zeros(6), noise.inner(C, s)) for C, s in zip(contours, lacks, strict=True)]
+    return Errors(by_cause=np.array(errors), planar=contours, shortfall=lacks, accepted=lacks[:, 3] < 0.8)
 
 
 def test_fitted_noise_holds_on_other_errors() -> None:
@@ -111,11 +117,27 @@ def test_noise_is_widened_by_what_other_folds_hold() -> None:
     assert normalised_squares(new, widened)[0].mean() < normalised_squares(new, alone)[0].mean()
 
 
+def test_noise_is_that_of_accepted_estimates() -> None:
+    """Errors of the others have tails that no Gaussian has: they must not make the accepted ones look uncertain."""
+    rng = np.random.default_rng(4)
+    folds = []
+    for _ in range(4):
+        errors = draw(120, rng)
+        errors.by_cause[~errors.accepted] *= rng.choice([1.0, 8.0], (np.count_nonzero(~errors.accepted), 1))
+        folds.append({"a": errors})
+    fitted = fit_noise(folds)["a"]
+    new = draw(2000, rng)
+    flat, whole = normalised_squares(new.take(new.accepted), fitted)
+    assert flat.mean() == pytest.approx(3.0, abs=0.4)
+    assert whole.mean() == pytest.approx(6.0, abs=0.6)
+
+
 def test_a_worse_contour_has_a_larger_covariance_up_to_a_limit() -> None:
     def size(**scores: float) -> float:
-        return float(np.linalg.det(NOISE.flat(GAUSS_NEWTON, shortfall_of(replace(CONTOUR, **scores)))))
+        return float(np.linalg.det(NOISE.flat(GAUSS_NEWTON, shortfall(replace(CONTOUR, **scores)))))
 
     assert size(matched_fraction=1.0) < size() < size(matched_fraction=0.2) < size(matched_fraction=0.2, explained=0.5)
+    assert np.all(shortfall(CONTOUR, 0.5) >= shortfall(CONTOUR)) and shortfall(CONTOUR, 1.0)[3] == 0.0
     bad = dict.fromkeys(("matched_fraction", "correlation", "explained"), -9.0)
     assert size(**bad) == size(**dict.fromkeys(bad, -10.0))
 

@@ -78,7 +78,7 @@ def test_fitted_weights_choose_and_decline_well() -> None:
 
 def test_covariances_hold_on_frames_they_were_not_fitted_on() -> None:
     found = frames(1, 20)
-    held = normalised_errors(found, fit_weights(found, CONFIG)[0].choice, CONFIG.folds)
+    held = normalised_errors(found, fit_weights(found, CONFIG)[0], CONFIG.folds)
     assert set(held) == {"block", "block, classic"}
     assert held["block"]["planar"] == pytest.approx(3.0, abs=0.6)
     assert held["block"]["pose"] == pytest.approx(6.0, abs=0.9)

@@ -1,0 +1,130 @@
+"""Learning curves: what is wrong on validation data after equal training on fewer images, and minute by minute.
+
+``python -m benchmarks.learning --data data --out runs/learning`` trains the segmenter and the joint classifier anew for
+every number of images, prints a table and draws ``learning.png``. ``--curves NAME.csv ...`` adds the errors against
+minutes of runs that are there. A run that was stopped goes on where it was; one that is finished is not repeated.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from benchmarks.tables import Section, show
+from perception.train_crops import ClassifierConfig
+from perception.train_segmentation import SegmentationTraining
+from perception.training import TrainingConfig
+from perception.training_curves import VALIDATION, read_curves
+from twin.training import ALL_CROPS, LANES, VAL_CROPS
+from twin.training_lanes import run_lanes
+
+ERRORS = {
+    "segmentation": {"missed at overlap 0.5": "recall50", "1 - AP50": "ap50"},
+    "classifier": {"wrong reading": "equal_view", "wrong class": "class"},
+}
+"""Errors by network, each 1 minus a figure of validation data."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """``data`` holds the data sets of ``tagcell train``. Every run learns for ``minutes``, two at a time."""
+
+    data: Path = Path("data")
+    out: Path = Path("runs/learning")
+    images: tuple[int, ...] = (250, 1000, 4000, 16000)
+    minutes: float = 8.0
+    curves: tuple[Path, ...] = ()
+    seed: int = 0
+
+
+def plan(config: Config, network: str, images: int) -> TrainingConfig:
+    """The run of a network on that many images."""
+    own = {
+        "out": config.out / f"{network}_{images}",
+        "images": images,
+        "minutes": config.minutes,
+        "validate_s": 1e6,
+        "seed": config.seed,
+    }
+    if network == "segmentation":
+        job = LANES[0][0]
+        data, val = (tuple(config.data / name for name in names) for names in (job.data, job.val))
+        return SegmentationTraining(data=data, val=val, **own)
+    data, val = (tuple(config.data / name for name in names) for names in (ALL_CROPS, VAL_CROPS))
+    return ClassifierConfig(data=data, val=val, **own)
+
+
+def learn(config: Config) -> dict[str, dict[int, dict[str, float]]]:
+    """Figures by network and number of images."""
+    runs = {network: [plan(config, network, images) for images in config.images] for network in ERRORS}
+    run_lanes([[(network, said(run)) for run in of] for network, of in runs.items()], at_once=os.cpu_count() or 1)
+    return {
+        network: {
+            images: json.loads((config.out / f"{network}_{images}" / f"{network}.json").read_text())["figures"]
+            for images in config.images
+        }
+        for network in ERRORS
+    }
+
+
+def said(run: TrainingConfig) -> dict[str, object]:
+    """The fields of a run's config."""
+    return {field.name: getattr(run, field.name) for field in fields(run)}
+
+
+def draw(figures: dict[str, dict[int, dict[str, float]]], config: Config) -> Path:
+    """``learning.png``: errors against images on the left, against minutes on the right."""
+    figure = Figure(figsize=(9.0, 3.8), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for network, names in ERRORS.items():
+        for label, name in names.items():
+            wrong = [1.0 - figures[network][images][name] for images in config.images]
+            left.plot(config.images, wrong, marker="o", label=f"{network}: {label}")
+    left.set(xscale="log", yscale="log", xlabel=f"images, {config.minutes:g} minutes each", ylabel="share on val data")
+    for path in config.curves:
+        curves, known = read_curves(path), ERRORS.get(path.stem, {})
+        for label, name in known.items():
+            values = curves.get(VALIDATION + name)
+            if values is not None:
+                seen = np.isfinite(values)
+                right.plot(curves["minutes"][seen], 1.0 - values[seen], marker=".", label=f"{path.stem}: {label}")
+    right.set(xlabel="minutes of training on all images")
+    for axes in (left, right):
+        axes.grid(color="0.92", which="both")
+        if axes.lines:
+            axes.legend(fontsize=8)
+    path = config.out / "learning.png"
+    aside = path.with_name(".learning.part.png")
+    figure.savefig(aside)
+    os.replace(aside, path)
+    return path
+
+
+def main(config: Config) -> None:
+    """Train what is missing, print the table and draw the picture."""
+    figures = learn(config)
+    sections = [
+        Section(
+            title=f"{network}: errors on validation data after {config.minutes:g} minutes",
+            columns=("images", *names),
+            rows=[
+                (str(images), *(f"{1.0 - row[name]:.4f}" for name in names.values()))
+                for images, row in figures[network].items()
+            ],
+        )
+        for network, names in ERRORS.items()
+    ]
+    show(sections, f"seed {config.seed}, one thread each, two at a time", as_json=False)
+    print(draw(figures, config))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
