@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Array
-from perception.covariance import NoiseModel
+from perception.covariance import NoiseModel, face_name
 from perception.estimates import PerceptionError
 
 FEATURES = (
@@ -90,7 +90,7 @@ class CropContext:
 
 @dataclass(frozen=True, kw_only=True)
 class ChoiceWeights:
-    """Weights by name, thresholds, the noise of poses by part, and what all was fitted on.
+    """Weights by name, thresholds, the noise of poses by part and face, and what all was fitted on.
 
     An estimate is accepted above the probability ``accept_above`` of being right, and is none of a part below
     ``part_above``. Scores over ``temperature`` give the probabilities of the readings; the likeliest that together have
@@ -152,9 +152,11 @@ class ChoiceWeights:
         aside.write_text(json.dumps(content, indent=2) + "\n")
         os.replace(aside, path)
 
-    def noise_of(self, part: str) -> NoiseModel:
-        """How much poses of a part scatter; the usual figures for a part that nothing was fitted for."""
-        return self.noise.get(part, NoiseModel())
+    def noise_of(self, part: str, stable_pose: int) -> NoiseModel:
+        """How much poses of a part that rests so scatter; those of the part in any pose when that is not known, the
+        usual figures for a part that nothing was fitted for.
+        """
+        return self.noise.get(face_name(part, stable_pose)) or self.noise.get(part, NoiseModel())
 
     def scores(self, evidence: Array) -> Array:
         """Scores (H,) in nats of hypotheses with evidence (H, len(FEATURES))."""

@@ -34,7 +34,7 @@ from perception.faces import FaceTable
 from perception.ground_truth import FrameTruth, GroundTruth, TruePart, read_ground_truth
 from perception.planar import on_plane, planar_of
 
-VERSION = 1
+VERSION = 2
 """Of the files; another one is collected anew."""
 
 RIGHT_PLACE_M = 1.5e-4
@@ -51,8 +51,9 @@ class CropFindings:
     """One crop: for every candidate its evidence (H, F), whether it is of the likeliest hypothesis, the right one, and
     usable, which reading it is and where (x, y); whether the pipeline would have been ``sure``; the crop's context.
 
-    ``part`` is the truth, "" where there is none, and ``whole`` says that it counts. Of every candidate that is usable
-    ``errors`` has (x, y, yaw, height, lean, lean), of the others None, and ``planar`` Gauss-Newton's covariance.
+    ``part`` and ``stable_pose`` are the truth, "" and -1 where there is none, and ``whole`` says that it counts. Of
+    every candidate that is usable ``errors`` has (x, y, yaw, height, lean, lean), of the others None, and ``planar``
+    Gauss-Newton's covariance.
     """
 
     evidence: list[list[float]]
@@ -65,6 +66,7 @@ class CropFindings:
     sure: bool
     context: CropContext
     part: str
+    stable_pose: int
     whole: bool
     errors: list[list[float] | None]
     planar: list[list[list[float]]]
@@ -237,6 +239,7 @@ def _judged(
         sure=pose.sure,
         context=pose.context,
         part=nearest.part.part.name if nearest else "",
+        stable_pose=nearest.part.stable_pose if nearest else -1,
         whole=nearest is None or nearest.part.whole,
         errors=[
             _error(nearest.part, c, T_cam_table) if nearest and good else None

@@ -38,19 +38,19 @@ class ContourConfig:
     grid_step_px: float = 2.0
     grid_yaw: float = float(np.radians(5.0))
     grid_yaw_step: float = float(np.radians(1.67))
-    starts: int = 2
+    starts: int = 5
     reach_px: tuple[float, ...] = (4.0, 3.0, 2.0)
     edge_step_px: float = 0.5
     scan_px: float = 4.0
-    candidates: int = 4
+    candidates: int = 6
     stride: int = 4
     rounds: int = 3
     inlier_px: float = 1.0
     start_sigma_m: float = 3.5e-4
     stray_cost: float = 0.005
-    places: int = 2
+    places: int = 3
     apart_m: float = 1.5e-4
-    nearly: float = 0.08
+    nearly: float = 0.15
     profile: ProfileConfig = field(default_factory=ProfileConfig)
 
     def __post_init__(self) -> None:

@@ -149,8 +149,21 @@ def joined(errors: Sequence[Errors]) -> Errors:
     return Errors(**{field.name: np.concatenate([getattr(e, field.name) for e in errors]) for field in fields(Errors)})
 
 
+def face_name(part: str, stable_pose: int) -> str:
+    """What the noise of a part that rests on one stable pose is kept under; that of all its poses under the part."""
+    return f"{part} {stable_pose}"
+
+
+def with_parts(by_face: Mapping[str, Errors]) -> dict[str, Errors]:
+    """Errors by face, and by part those of all its faces."""
+    out = dict(by_face)
+    for part in sorted({face.rsplit(" ", 1)[0] for face in by_face}):
+        out[part] = joined([errors for face, errors in by_face.items() if face.rsplit(" ", 1)[0] == part])
+    return out
+
+
 def fit_noise(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
-    """The noise of every part of which there are 20 estimates, from errors by part in folds of frames.
+    """The noise of every part, and every face, of which there are 20 estimates, from errors by face in folds of frames.
 
     It is that of greatest likelihood, widened or narrowed to what the accepted ones show in a fold that it was not
     fitted on: a model that has seen few errors has seen few of the large ones, and one of large errors too is too wide
@@ -162,11 +175,12 @@ def fit_noise(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
     squares: dict[str, list[Array]] = {}
     for i, fold in enumerate(folds):
         others = _fitted([other for k, other in enumerate(folds) if k != i])
-        for part in set(fold) & set(others):
-            accepted = fold[part].take(fold[part].accepted)
-            squares.setdefault(part, []).append(normalised_squares(accepted, others[part])[0])
-    factor = {part: _mean_of(np.concatenate(found)) / 3.0 for part, found in squares.items()}
-    return {part: model.widened(factor.get(part, 1.0)) for part, model in noise.items()}
+        for name, errors in with_parts(fold).items():
+            if name in others:
+                accepted = errors.take(errors.accepted)
+                squares.setdefault(name, []).append(normalised_squares(accepted, others[name])[0])
+    factor = {name: _mean_of(np.concatenate(found)) / 3.0 for name, found in squares.items()}
+    return {name: model.widened(factor.get(name, 1.0)) for name, model in noise.items()}
 
 
 def _mean_of(squares: Array) -> float:
@@ -175,18 +189,22 @@ def _mean_of(squares: Array) -> float:
 
 
 def _fitted(folds: Sequence[Mapping[str, Errors]]) -> dict[str, NoiseModel]:
-    """Greatest likelihood; how errors grow with bad contours parts have in common. Gross outliers are left out: it is
-    for the gate to find them.
+    """Greatest likelihood; how errors grow with bad contours all have in common. Gross outliers are left out: it is for
+    the gate to find them.
     """
-    parts = sorted({part for fold in folds for part in fold})
-    by_part = {part: joined([fold[part] for fold in folds if part in fold]) for part in parts}
-    enough = {part: errors for part, errors in by_part.items() if len(errors) >= FEWEST}
-    if not enough:
+    faces = sorted({face for fold in folds for face in fold})
+    named = with_parts({face: joined([fold[face] for fold in folds if face in fold]) for face in faces})
+    enough = {name: errors for name, errors in named.items() if len(errors) >= FEWEST}
+    parts = {name: errors for name, errors in enough.items() if name not in faces}
+    if not parts:
         return {}
-    noise = {part: _typical(errors) for part, errors in enough.items()}
+    noise = {name: _typical(errors) for name, errors in enough.items()}
     for _ in range(2):
-        kept = {part: e.take(normalised_squares(e, noise[part])[1] < GROSS) for part, e in enough.items()}
-        noise = _likeliest(kept)
+        kept = {name: e.take(normalised_squares(e, noise[name])[1] < GROSS) for name, e in enough.items()}
+        noise = _likeliest({name: kept[name] for name in parts}, growth=None)
+        growth = next(iter(noise.values())).growth
+        for name in enough.keys() - parts.keys():
+            noise |= _likeliest({name: kept[name]}, growth)
     return noise
 
 
@@ -212,30 +230,31 @@ _UNIT = np.array([1e-5, 1e-5, 1e-3])  # so that all is near one
 _START = np.log([100.0, 1.0, 1.0])
 
 
-def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
-    parts = list(by_part)
-    count = sum(len(errors) for errors in by_part.values())
-    upright = {part: _off_plane(errors) for part, errors in by_part.items()}
+def _likeliest(by_name: Mapping[str, Errors], growth: tuple[float, ...] | None) -> dict[str, NoiseModel]:
+    """Noise of greatest likelihood, with the growth that all have in common unless that is given."""
+    names, n_growth = list(by_name), len(QUALITIES) + 1 if growth is None else 0
+    count = sum(len(errors) for errors in by_name.values())
+    upright = {name: _off_plane(errors) for name, errors in by_name.items()}
 
     def unpacked(values: Array) -> dict[str, NoiseModel]:
-        growth = tuple(values[3 * len(parts) :].tolist())
-        logs = values[: 3 * len(parts)].reshape(-1, 3)
+        grows = tuple(values[3 * len(names) :].tolist()) if growth is None else growth
+        logs = values[: 3 * len(names)].reshape(-1, 3)
         return {
-            part: NoiseModel(
+            name: NoiseModel(
                 scale=float(np.exp(scale)),
                 floor_m=float(np.exp(floor) * _UNIT[0]),
                 floor_rad=float(np.exp(floor_yaw) * _UNIT[2]),
-                height_m=float(np.sqrt(np.mean(upright[part][:, 0] ** 2)) + 1e-7),
-                lean_rad=float(np.sqrt(np.mean(upright[part][:, 1:] ** 2)) + 1e-6),
-                growth=growth,
+                height_m=float(np.sqrt(np.mean(upright[name][:, 0] ** 2)) + 1e-7),
+                lean_rad=float(np.sqrt(np.mean(upright[name][:, 1:] ** 2)) + 1e-6),
+                growth=grows,
             )
-            for part, (scale, floor, floor_yaw) in zip(parts, logs, strict=True)
+            for name, (scale, floor, floor_yaw) in zip(names, logs, strict=True)
         }
 
     def loss(values: Array) -> float:
         total = 0.0
-        for part, noise in unpacked(values).items():
-            errors = by_part[part]
+        for name, noise in unpacked(values).items():
+            errors = by_name[name]
             S = noise.flat(errors.planar, errors.shortfall) / np.outer(_UNIT, _UNIT)
             e = errors.by_cause[:, :3] / _UNIT
             squares = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[..., None])[..., 0])
@@ -243,7 +262,6 @@ def _likeliest(by_part: Mapping[str, Errors]) -> dict[str, NoiseModel]:
         # A weak pull to the start decides where scale, floor and growth can stand for each other.
         return total + 1e-3 * float(np.sum((values - first) ** 2))
 
-    n_growth = len(QUALITIES) + 1
-    first = np.append(np.tile(_START, len(parts)), np.zeros(n_growth))
-    bounds = [(value - 8.0, value + 8.0) for value in first[: 3 * len(parts)]] + [(0.0, 10.0)] * n_growth
+    first = np.append(np.tile(_START, len(names)), np.zeros(n_growth))
+    bounds = [(value - 8.0, value + 8.0) for value in first[: 3 * len(names)]] + [(0.0, 10.0)] * n_growth
     return unpacked(minimize(loss, first, method="L-BFGS-B", bounds=bounds).x)

@@ -172,15 +172,14 @@ class LearnedEstimator:
         mask, origin = silhouette_mask(winner.face.part, T_cam_part, frame.intrinsics)
         r = winner.refinement
         alternatives = self.solver.alternatives(pose, T_cam_table)
+        noise = self.solver.weights.noise_of(winner.face.part.name, winner.face.stable_pose.index)
         return PartEstimate(
             part=winner.face.part.name,
             T_cam_part=T_cam_part,
             stable_pose=winner.face.stable_pose.index,
             score=pose.probability,
             verdict=self._verdict(pose, len(alternatives)),
-            covariance=pose_covariance(
-                r, pose.probability, self.solver.weights.noise_of(winner.face.part.name), T_cam_table, T_cam_part
-            ),
+            covariance=pose_covariance(r, pose.probability, noise, T_cam_table, T_cam_part),
             raw_T_cam_part=_raw_pose(winner, intrinsics.downscaled(HALF)),
             mask=mask,
             mask_origin=origin,

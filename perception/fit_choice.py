@@ -28,7 +28,7 @@ from perception.choice_models import (
     fit_temperature,
     wrong_share_bound,
 )
-from perception.covariance import QUALITIES, Errors, fit_noise, normalised_squares, shortfall_of
+from perception.covariance import QUALITIES, Errors, face_name, fit_noise, normalised_squares, shortfall_of
 from perception.crop_poses import SAME_PLACE_M
 from perception.estimates import PerceptionError
 from perception.estimator import CHOICE_FILE, EstimatorConfig
@@ -40,15 +40,17 @@ class ChoiceFitConfig:
     """``data`` are data sets of whole frames with ground truth, of any domains, ``out`` the folder with the networks'
     weights, to which ``choice.json`` is written. Findings are kept in ``cache``, by default beside it.
 
-    Of accepted estimates ``wanted_right`` are to have the right branch and be usable: so that the Clopper-Pearson bound
-    with ``confidence`` of the share that is not stays below the rest. ``covered`` is how often the prediction set is to
+    Of accepted estimates ``wanted_right`` are to have the right branch and ``wanted_usable`` to be good enough for
+    placing as well: so that the Clopper-Pearson bounds with ``confidence`` of the shares that are not stay below the
+    rest. ``covered`` is how often the prediction set is to
     hold the right reading. ``jobs`` processes run with one thread each.
     """
 
     data: tuple[Path, ...]
     out: Path
     cache: Path | None = None
-    wanted_right: float = 0.995
+    wanted_right: float = 0.9925
+    wanted_usable: float = 0.98
     confidence: float = 0.5
     covered: float = 0.99
     folds: int = 5
@@ -56,7 +58,7 @@ class ChoiceFitConfig:
     parts_dir: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in ("wanted_right", "confidence", "covered"):
+        for name in ("wanted_right", "wanted_usable", "confidence", "covered"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be between 0 and 1")
         if self.folds < 3 or self.jobs < 1:
@@ -65,11 +67,12 @@ class ChoiceFitConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Winners:
-    """The winners of N crops: the gate's evidence (N, G), which are right and usable, which crops show a part (N,), and
-    the probabilities (N,) of both by models that have not seen their frames.
+    """The winners of N crops: the gate's evidence (N, G), which have the right branch, which are usable too, which
+    crops show a part (N,), and the probabilities (N,) of the latter two by models that have not seen their frames.
     """
 
     evidence: Array
+    right: NDArray[np.bool_]
     usable: NDArray[np.bool_]
     has_part: NDArray[np.bool_]
     probability: Array = field(default_factory=lambda: np.zeros(0))
@@ -104,6 +107,7 @@ def winners_of(crops: Sequence[CropFindings], weights: ChoiceWeights) -> Winners
     found = [winner_of(crop, weights) for crop in crops]
     return Winners(
         evidence=np.stack([gate for *_, gate in found]),
+        right=np.array([crop.right_reading[best] for crop, (best, *_) in zip(crops, found, strict=True)]),
         usable=np.array([crop.usable[best] for crop, (best, *_) in zip(crops, found, strict=True)]),
         has_part=np.array([bool(crop.part) for crop in crops]),
     )
@@ -146,7 +150,10 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
         )
     ordered = [crop for fold in range(config.folds) for frame in frames[fold :: config.folds] for crop in frame]
     held_out, scores = cross_fitted(frames, config.folds)
-    threshold = cautious_threshold(held_out.probability, held_out.usable, config.wanted_right, config.confidence)
+    threshold = max(
+        cautious_threshold(held_out.probability, held_out.right, config.wanted_right, config.confidence),
+        cautious_threshold(held_out.probability, held_out.usable, config.wanted_usable, config.confidence),
+    )
     temperature, mass = _prediction_set(ordered, scores, config.covered)
 
     choice = choice_of(ordered)
@@ -165,8 +172,8 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
     return weights, _figures(findings, ordered, scores, held_out, weights)
 
 
-def errors_by_part(crops: Sequence[CropFindings], weights: ChoiceWeights) -> dict[str, Errors]:
-    """Errors of the winners that are whole and usable, by part."""
+def errors_by_face(crops: Sequence[CropFindings], weights: ChoiceWeights) -> dict[str, Errors]:
+    """Errors of the winners that are whole and usable, by the part's true face."""
     columns = [FEATURES.index(name) for name in QUALITIES]
     rows: dict[str, list[tuple[list[float], list[list[float]], Array, bool]]] = {}
     for crop in crops:
@@ -176,10 +183,12 @@ def errors_by_part(crops: Sequence[CropFindings], weights: ChoiceWeights) -> dic
             continue
         p = float(weights.probability_right(gate))
         shortfall = shortfall_of([crop.evidence[best][k] for k in columns], p)
-        rows.setdefault(crop.part, []).append((error, crop.planar[best], shortfall, p > weights.accept_above))
+        rows.setdefault(face_name(crop.part, crop.stable_pose), []).append(
+            (error, crop.planar[best], shortfall, p > weights.accept_above)
+        )
     return {
-        part: Errors(**{name: np.array(column) for name, column in zip(_ERRORS, zip(*found, strict=True), strict=True)})
-        for part, found in sorted(rows.items())
+        face: Errors(**{name: np.array(column) for name, column in zip(_ERRORS, zip(*found, strict=True), strict=True)})
+        for face, found in sorted(rows.items())
     }
 
 
@@ -188,7 +197,7 @@ _ERRORS = ("by_cause", "planar", "shortfall", "accepted")
 
 def _errors_in_folds(findings: Sequence[FrameFindings], weights: ChoiceWeights, folds: int) -> list[dict[str, Errors]]:
     return [
-        errors_by_part([crop for frame in findings[k::folds] for crop in frame.crops], weights) for k in range(folds)
+        errors_by_face([crop for frame in findings[k::folds] for crop in frame.crops], weights) for k in range(folds)
     ]
 
 
@@ -203,10 +212,11 @@ def normalised_errors(
     for k in range(folds):
         fitted = fit_noise([fold for i, fold in enumerate(errors) if i != k])
         for frame in findings[k::folds]:
-            for part, every in errors_by_part(frame.crops, weights).items():
-                own = every.take(every.accepted)
-                if part in fitted and len(own):
-                    for pair in zip(*normalised_squares(own, fitted[part]), strict=True):
+            for face, every in errors_by_face(frame.crops, weights).items():
+                own, part = every.take(every.accepted), face.rsplit(" ", 1)[0]
+                noise = fitted.get(face) or fitted.get(part)
+                if noise is not None and len(own):
+                    for pair in zip(*normalised_squares(own, noise), strict=True):
                         for name in (f"{part}, {frame.domain}", part):
                             seen.setdefault(name, []).append(pair)
     return {
@@ -228,7 +238,7 @@ def _prediction_set(crops: Sequence[CropFindings], scores: Sequence[Array], cove
         order = np.argsort(-p, kind="stable")
         before.append(float(np.append(0.0, np.cumsum(p[order]))[int(np.argmax(right[order]))]))
     level = min(1.0, np.ceil((len(before) + 1) * covered) / len(before))  # split conformal prediction's quantile
-    return temperature, float(np.clip(np.quantile(before, level, method="higher") + 1e-6, 0.9, 0.9999))
+    return temperature, float(np.clip(np.quantile(before, level, method="higher") + 1e-6, 0.5, 0.9999))
 
 
 def _readings(crop: CropFindings, scores: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -247,10 +257,10 @@ def _figures(
     held_out: Winners,
     weights: ChoiceWeights,
 ) -> dict[str, float]:
-    has, usable = held_out.has_part, held_out.usable
+    has, usable, right_branch = held_out.has_part, held_out.usable, held_out.right
     kept = held_out.part_probability >= weights.part_above
     accepted = (held_out.probability > weights.accept_above) & kept
-    wrong, n = int((accepted & ~usable).sum()), int(accepted.sum())
+    wrong, n = int((accepted & ~right_branch).sum()), int(accepted.sum())
     sets = [_readings(crop, s) for crop, s in zip(crops, scores, strict=True) if crop.part]
     sizes, holds = [], []
     for best, right in sets:
@@ -262,11 +272,13 @@ def _figures(
         "frames": len(findings),
         "parts": whole,
         "found": sum(frame.found_parts for frame in findings) / max(whole, 1),
+        "branch_right": float(right_branch[has].mean()),
         "usable": float(usable[has].mean()),
         "best_possible": float(np.mean([any(crop.usable) for crop in crops if crop.part])),
         "sure": float(np.mean([crop.sure for crop in crops if crop.part])),
         "accepted": float((accepted & has).sum() / max(whole, 1)),
         "accepted_wrong": wrong,
+        "accepted_unusable": int((accepted & ~usable).sum()),
         "wrong_upper_95": float(wrong_share_bound(wrong, n, 0.95)) if n else 1.0,
         "part_kept": float(kept[has].mean()),
         "empty_kept": float(kept[~has].mean()) if (~has).any() else 0.0,

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -152,8 +153,10 @@ def test_weights_round_trip(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "choice.json")
     assert ChoiceWeights.load(tmp_path / "choice.json") == PLAIN
     assert [p.name for p in tmp_path.iterdir()] == ["choice.json"]
-    assert PLAIN.noise_of("block").floor_m == 2e-5
-    assert PLAIN.noise_of("another") == NoiseModel()
+    assert PLAIN.noise_of("block", 0).floor_m == 2e-5
+    upright = replace(PLAIN, noise=PLAIN.noise | {"block 1": NoiseModel(floor_m=5e-5)})
+    assert upright.noise_of("block", 1).floor_m == 5e-5 and upright.noise_of("block", 2).floor_m == 2e-5
+    assert PLAIN.noise_of("another", 0) == NoiseModel()
 
 
 def test_missing_and_unfit_weights_are_errors(tmp_path: Path) -> None:

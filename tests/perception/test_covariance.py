@@ -92,23 +92,34 @@ def draw(n: int, rng: np.random.Generator, noise: NoiseModel = NOISE) -> Errors:
 def test_fitted_noise_holds_on_other_errors() -> None:
     rng = np.random.default_rng(1)
     other = replace(NOISE, floor_m=3e-5, floor_rad=4e-3)
-    seen = {"a": draw(300, rng), "b": draw(300, rng, other)}
-    seen["a"].by_cause[:3, 0] = 3e-3  # a rim taken for the outline
+    seen = {"a 0": draw(300, rng), "b 1": draw(300, rng, other)}
+    seen["a 0"].by_cause[:3, 0] = 3e-3  # a rim taken for the outline
     fitted = fit_noise([seen])
-    for part, noise in (("a", NOISE), ("b", other)):
+    for part, noise in (("a", NOISE), ("b", other), ("a 0", NOISE), ("b 1", other)):
         new = draw(2000, rng, noise)
         flat, whole = normalised_squares(new, fitted[part])
-        assert flat.mean() == pytest.approx(3.0, abs=0.4)
+        assert flat.mean() == pytest.approx(3.0, abs=0.5)
         assert whole.mean() == pytest.approx(6.0, abs=0.6)
         bad = new.shortfall[:, 0] > 0.4
         assert flat[bad].mean() == pytest.approx(3.0, abs=0.6)  # it grows as it should where contours are bad
     assert fitted["a"].height_m == pytest.approx(NOISE.height_m, rel=0.15)
 
 
+def test_faces_of_a_part_have_noise_of_their_own_and_rare_ones_that_of_the_part() -> None:
+    rng = np.random.default_rng(5)
+    upright = replace(NOISE, floor_m=6e-5, floor_rad=6e-3)
+    fitted = fit_noise([{"a 0": draw(200, rng), "a 1": draw(200, rng, upright), "a 2": draw(5, rng)} for _ in range(3)])
+    assert set(fitted) == {"a", "a 0", "a 1"}
+    assert 3 * fitted["a 0"].floor_m < fitted["a 1"].floor_m
+    for face, noise in (("a 0", NOISE), ("a 1", upright)):
+        new = draw(2000, rng, noise)
+        assert normalised_squares(new.take(new.accepted), fitted[face])[0].mean() == pytest.approx(3.0, abs=0.4)
+
+
 def test_noise_is_widened_by_what_other_folds_hold() -> None:
     rng = np.random.default_rng(3)
-    folds = [{"a": draw(25, rng)} for _ in range(4)]
-    alone, widened = fit_noise([{"a": joined([fold["a"] for fold in folds])}])["a"], fit_noise(folds)["a"]
+    folds = [{"a 0": draw(25, rng)} for _ in range(4)]
+    alone, widened = fit_noise([{"a 0": joined([fold["a 0"] for fold in folds])}])["a"], fit_noise(folds)["a"]
     factor = widened.scale / alone.scale
     assert 1.0 < factor < 2.0
     assert widened.floor_m == pytest.approx(alone.floor_m * np.sqrt(factor), rel=1e-3)
@@ -124,7 +135,7 @@ def test_noise_is_that_of_accepted_estimates() -> None:
     for _ in range(4):
         errors = draw(120, rng)
         errors.by_cause[~errors.accepted] *= rng.choice([1.0, 8.0], (np.count_nonzero(~errors.accepted), 1))
-        folds.append({"a": errors})
+        folds.append({"a 0": errors})
     fitted = fit_noise(folds)["a"]
     new = draw(2000, rng)
     flat, whole = normalised_squares(new.take(new.accepted), fitted)
@@ -143,7 +154,7 @@ def test_a_worse_contour_has_a_larger_covariance_up_to_a_limit() -> None:
 
 
 def test_few_errors_say_nothing() -> None:
-    assert fit_noise([{"a": draw(5, np.random.default_rng(2))}]) == {}
+    assert fit_noise([{"a 0": draw(5, np.random.default_rng(2))}]) == {}
     with pytest.raises(ValueError, match="floor_m"):
         NoiseModel(floor_m=0.0)
     with pytest.raises(ValueError, match="growth"):

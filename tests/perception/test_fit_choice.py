@@ -41,6 +41,7 @@ def crop(rng: np.random.Generator, has: bool) -> CropFindings:
         sure=False,
         context=context,
         part="block" if has else "",
+        stable_pose=0 if has else -1,
         whole=True,
         errors=[rng.normal(0, SIGMA).tolist() if r else None for r in right],
         planar=[np.diag(np.square([1e-7, 1e-7, 1e-5])).tolist()] * 3,
@@ -70,6 +71,7 @@ def test_fitted_weights_choose_and_decline_well() -> None:
     assert figures["best_possible"] == 1.0
     assert figures["accepted"] > 0.8
     assert figures["accepted_wrong"] <= (1 - CONFIG.wanted_right) * 0.9 * 400
+    assert figures["accepted_wrong"] <= figures["accepted_unusable"] <= (1 - CONFIG.wanted_usable) * 0.9 * 400
     assert figures["part_kept"] > 0.95
     assert figures["empty_kept"] < 0.15
     assert figures["set_holds"] >= 0.97

@@ -10,7 +10,7 @@ from torch import nn
 from perception import training, weight_files
 from perception.estimates import PerceptionError
 from perception.train import main, trainer
-from perception.training import TrainingConfig, TrainingResult, learning_rate_at, seeded, train
+from perception.training import TrainingConfig, TrainingResult, evenly_chosen, learning_rate_at, seeded, train
 from perception.weight_files import load_weights, save_weights, trained_with, weights_metadata
 
 
@@ -166,3 +166,12 @@ def test_command_line_names_the_networks(capsys: pytest.CaptureFixture[str]) -> 
     assert "segmentation" in capsys.readouterr().err
     with pytest.raises(PerceptionError, match="nonesuch"):
         trainer("nonesuch")
+
+
+def test_fewer_images_are_evenly_chosen() -> None:
+    np.testing.assert_array_equal(evenly_chosen(9, 5), [0, 2, 4, 6, 8])
+    np.testing.assert_array_equal(evenly_chosen(4, None), range(4))
+    np.testing.assert_array_equal(evenly_chosen(4, 99), range(4))
+    assert len(set(evenly_chosen(1000, 333).tolist())) == 333
+    with pytest.raises(PerceptionError, match="0 images to learn from"):
+        evenly_chosen(4, 0)
