@@ -30,6 +30,7 @@ from perception.region import region_scores
 from perception.shortlist import Shortlist, ShortlistConfig, shortlist, turned_by_keypoints
 from perception.sighting import Sighting
 from perception.silhouette import render_view
+from perception.threads import spread
 
 SAME_PLACE_M = 3e-4
 """Candidates of one reading that lie nearer are no rivals: either would do for placing a part."""
@@ -188,11 +189,14 @@ class CropSolver:
         spent["keypoints"] += time.perf_counter() - started
 
         started = time.perf_counter()
-        out = []
-        for i, (view, found) in enumerate(zip(views, short, strict=True)):
+
+        def chosen(i: int) -> CropPose:
+            view, found = views[i], short[i]
             votes = {face: keypoints for (row, face), keypoints in voted.items() if row == i}
             candidates = self._refined(view, found.wanted, votes) if found.wanted else [self._unrefined(view)]
-            out.append(self._choose(candidates, view, found.sure))
+            return self._choose(candidates, view, found.sure)
+
+        out = spread(chosen, range(len(views)))
         spent["refinement"] += time.perf_counter() - started
         return out
 

@@ -19,7 +19,7 @@ from perception.maskrcnn import MIN_SCORE, WEIGHTS, MaskRCNNSegmenter, build_net
 from perception.segmentation import WEIGHTS as ENCODER_WEIGHTS
 from perception.segmentation import Segmenter, normalise
 from perception.train_segmentation import Examined, SegmentationTraining, examine, example, figures_of
-from perception.training import Losses, seeded, train
+from perception.training import Losses, evenly_chosen, seeded, train
 from perception.weight_files import load_weights, save_weights, weights_metadata
 from perception.windows import MIN_VISIBLE_PX, Window, Windows
 
@@ -30,8 +30,8 @@ THRESHOLDS = tuple(np.arange(0.05, 0.96, 0.05).round(2).tolist())
 class MaskRCNNTraining(SegmentationTraining):
     """As for our segmenter, with what suits this network: ``size`` a multiple of 32.
 
-    Of each data set the first ``windows`` are used and kept in memory. ``encoder`` is the folder of our segmenter's
-    weights, whose encoder the training starts with.
+    Of each data set the first ``windows`` are kept in memory, and of these ``images`` learned from. ``encoder`` is the
+    folder of our segmenter's weights, whose encoder the training starts with.
     """
 
     encoder: Path = Path("perception/weights")
@@ -80,6 +80,7 @@ def train_maskrcnn(config: MaskRCNNTraining) -> None:
     parts = [load_part(name, config.parts_dir) for name in names]
     training = [visible_windows(path, parts, config.windows) for path in config.data]
     validation = [w[i] for w in (visible_windows(path, parts) for path in config.val) for i in range(len(w))]
+    learned = [evenly_chosen(len(windows), config.images) for windows in training]
     share = np.array([len(windows) for windows in training]) / sum(len(windows) for windows in training)
     device = default_device()
     encoder = Segmenter.load(config.encoder, config.parts_dir).net
@@ -93,7 +94,7 @@ def train_maskrcnn(config: MaskRCNNTraining) -> None:
 
     def step(rng: np.random.Generator) -> Losses:
         chosen = rng.choice(len(training), config.batch, p=share)
-        examples = [example(training[i], rng, config) for i in chosen]
+        examples = [example(training[i], learned[i], rng, config) for i in chosen]
         images = [torch.from_numpy(normalise(e.image)).permute(2, 0, 1).to(device) for e in examples]
         targets = [{key: value.to(device) for key, value in target_of(e).items()} for e in examples]
         return net(images, targets)
