@@ -131,7 +131,9 @@ def cross_fitted(frames: Sequence[Sequence[CropFindings]], folds: int) -> tuple[
             replace(
                 new,
                 probability=weights.probability_right(new.evidence),
-                part_probability=weights.probability_part(new.evidence),
+                part_probability=np.maximum(
+                    weights.probability_part(new.evidence), weights.probability_right(new.evidence)
+                ),
             )
         )
         scores += [winner_of(crop, weights)[1] for crop in mine]

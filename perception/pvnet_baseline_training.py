@@ -36,8 +36,8 @@ SAME_BRANCH = np.radians(6.0)
 
 @dataclass(frozen=True, kw_only=True)
 class PvnetConfig(CropTrainingConfig):
-    """``batch`` crops of each part a step; ``samples`` cells of each mask enter the loss. ``start`` is a weight file to
-    start from: that of our own votes, or of an earlier training of these networks.
+    """``batch`` crops of each part a step; ``samples`` cells of each mask enter the loss. ``encoder`` is the folder of
+    the weights of our own votes, whose encoder a training without ``start`` begins with.
     """
 
     minutes: float = 30.0
@@ -48,7 +48,7 @@ class PvnetConfig(CropTrainingConfig):
     seed: int = 3
     validate: int = 150
     validate_s: float = 600.0
-    start: Path | None = None
+    encoder: Path | None = None
 
 
 def pvnet_step(nets: Pvnets, source: CropSource, config: PvnetConfig) -> Step:
@@ -79,8 +79,8 @@ def train_pvnet(config: PvnetConfig) -> TrainingResult:
 
     def build(table: FaceTable) -> Pvnets:
         nets = Pvnets({part.name: len(part.keypoints) for part in table.parts})
-        if config.start is not None:
-            nets.start_from(load_weights(config.start, config.parts_dir)[0])
+        if config.encoder is not None:
+            nets.start_from(load_weights(config.encoder / "keypoints.safetensors", config.parts_dir)[0])
         return nets
 
     return train_on_crops("pvnet", config, build, pvnet_step, score_pvnet)

@@ -8,13 +8,16 @@ import torch
 from cad.parts import planar
 from cad.spatial import BASLER, rotation_x, transform
 from perception import pvnet_baseline_training as training
+from perception import train_crops
 from perception.dataset import CropSet
 from perception.faces import FaceTable
 from perception.labels import CropLabels, label_crops
 from perception.posenets import CropKeypoints
+from perception.pvnet import PVNet
 from perception.pvnet_baseline_net import Pvnets
-from perception.pvnet_baseline_training import PvnetConfig, pvnet_step, score_crops, score_pvnet
+from perception.pvnet_baseline_training import PvnetConfig, pvnet_step, score_crops, score_pvnet, train_pvnet
 from perception.train_crops import CropSource
+from perception.weight_files import load_weights, save_weights
 
 TABLE = FaceTable.load(["inserted", "top"])
 FACES = np.array([0, 1, 4, 6, -1, 2])
@@ -103,3 +106,25 @@ def test_a_step_trains_every_part_on_its_own_crops(tmp_path: Path) -> None:
         torch.stack(list(losses.values())).sum().backward()
         optimizer.step()
     assert totals[-1] < 0.9 * totals[0]
+
+
+def test_training_begins_with_the_encoder_of_our_votes_or_goes_on_from_its_own_weights(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    crops, _ = crops_and_labels()
+    monkeypatch.setattr(train_crops, "load_crops", lambda *paths: crops)
+    monkeypatch.setattr(train_crops, "manifest_hash", lambda path: "0123")
+    monkeypatch.setattr(training, "score_pvnet", lambda *_: {"branch_right": 1.0})
+    votes = PVNet.for_table(TABLE)
+    save_weights(tmp_path / "votes" / "keypoints.safetensors", votes.state_dict(), {"parts": {}})
+    said = {"data": (tmp_path,), "val": (tmp_path,), "parts": ("inserted", "top"), "batch": 2, "samples": 16}
+    said |= {"max_steps": 1, "ema_decay": 0.0}
+    train_pvnet(PvnetConfig(**said, out=tmp_path / "a", learning_rate=1e-9, encoder=tmp_path / "votes"))
+    first, _ = load_weights(tmp_path / "a" / "pvnet.safetensors")
+    np.testing.assert_allclose(
+        first["encoder.down3.0.0.weight"], votes.state_dict()["down3.0.0.weight"], rtol=2e-3, atol=1e-4
+    )
+    train_pvnet(PvnetConfig(**said, out=tmp_path / "b", learning_rate=1e-9, start=tmp_path / "a"))
+    second, about = load_weights(tmp_path / "b" / "pvnet.safetensors")
+    np.testing.assert_allclose(first["decoders.top.head.weight"], second["decoders.top.head.weight"], atol=1e-3)
+    assert about["minutes_before_start"] >= 0.0
