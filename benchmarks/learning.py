@@ -7,10 +7,10 @@ minutes of runs that are there. A run that was stopped goes on where it was; one
 
 from __future__ import annotations
 
-import json
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -18,11 +18,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.tables import Section, show
-from perception.train_crops import ClassifierConfig
-from perception.train_segmentation import SegmentationTraining
-from perception.training import TrainingConfig
+from cad.files import replacing
+from perception.bop_files import read_json
 from perception.training_curves import VALIDATION, read_curves
-from twin.training import ALL_CROPS, LANES, VAL_CROPS
+from twin.training import LANES
 from twin.training_lanes import run_lanes
 
 ERRORS = {
@@ -44,39 +43,31 @@ class Config:
     seed: int = 0
 
 
-def plan(config: Config, network: str, images: int) -> TrainingConfig:
-    """The run of a network on that many images."""
-    own = {
+def settings(config: Config, network: str, images: int) -> dict[str, Any]:
+    """What the config of a network's run on that many images is made of."""
+    job = next(job for lane in LANES for job in lane if job.network == network)
+    return {
+        "data": tuple(config.data / name for name in job.data),
+        "val": tuple(config.data / name for name in job.val),
         "out": config.out / f"{network}_{images}",
         "images": images,
         "minutes": config.minutes,
         "validate_s": 1e6,
         "seed": config.seed,
     }
-    if network == "segmentation":
-        job = LANES[0][0]
-        data, val = (tuple(config.data / name for name in names) for names in (job.data, job.val))
-        return SegmentationTraining(data=data, val=val, **own)
-    data, val = (tuple(config.data / name for name in names) for names in (ALL_CROPS, VAL_CROPS))
-    return ClassifierConfig(data=data, val=val, **own)
 
 
 def learn(config: Config) -> dict[str, dict[int, dict[str, float]]]:
     """Figures by network and number of images."""
-    runs = {network: [plan(config, network, images) for images in config.images] for network in ERRORS}
-    run_lanes([[(network, said(run)) for run in of] for network, of in runs.items()], at_once=os.cpu_count() or 1)
+    lanes = [[(network, settings(config, network, images)) for images in config.images] for network in ERRORS]
+    run_lanes(lanes, at_once=os.cpu_count() or 1)
     return {
         network: {
-            images: json.loads((config.out / f"{network}_{images}" / f"{network}.json").read_text())["figures"]
+            images: read_json(config.out / f"{network}_{images}" / f"{network}.json")["figures"]
             for images in config.images
         }
         for network in ERRORS
     }
-
-
-def said(run: TrainingConfig) -> dict[str, object]:
-    """The fields of a run's config."""
-    return {field.name: getattr(run, field.name) for field in fields(run)}
 
 
 def draw(figures: dict[str, dict[int, dict[str, float]]], config: Config) -> Path:
@@ -102,9 +93,8 @@ def draw(figures: dict[str, dict[int, dict[str, float]]], config: Config) -> Pat
         if axes.lines:
             axes.legend(fontsize=8)
     path = config.out / "learning.png"
-    aside = path.with_name(".learning.part.png")
-    figure.savefig(aside)
-    os.replace(aside, path)
+    with replacing(path) as aside:
+        figure.savefig(aside)
     return path
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cad.spatial import Array
-from perception.covariance import NoiseModel, face_name
+from perception.covariance import NoiseModel, face_name, noise_of
 from perception.estimates import PerceptionError
 
 FEATURES = (
@@ -156,7 +156,7 @@ class ChoiceWeights:
         """How much poses of a part that rests so scatter; those of the part in any pose when that is not known, the
         usual figures for a part that nothing was fitted for.
         """
-        return self.noise.get(face_name(part, stable_pose)) or self.noise.get(part, NoiseModel())
+        return noise_of(self.noise, face_name(part, stable_pose)) or NoiseModel()
 
     def scores(self, evidence: Array) -> Array:
         """Scores (H,) in nats of hypotheses with evidence (H, len(FEATURES))."""
@@ -169,8 +169,11 @@ class ChoiceWeights:
         return good * _logistic(self.rivalry["constant"] + self.rivalry["lead"] * lead)
 
     def probability_part(self, gate_evidence: Array) -> Array:
-        """Probability (...) that a crop whose winner has evidence (..., len(GATE_FEATURES)) shows a part."""
-        return _logistic(gate_evidence @ np.array([self.part[name] for name in GATE_FEATURES]))
+        """Probability (...) that a crop whose winner has evidence (..., len(GATE_FEATURES)) shows a part: at least that
+        of being right, since what is right is a part, whatever the two models make of the same evidence.
+        """
+        seen = _logistic(gate_evidence @ np.array([self.part[name] for name in GATE_FEATURES]))
+        return np.maximum(seen, self.probability_right(gate_evidence))
 
 
 NEUTRAL = ChoiceWeights(

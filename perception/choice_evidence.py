@@ -25,9 +25,9 @@ from cad.parts import hash_file
 from cad.resting import as_rest
 from cad.spatial import Array, inverse, rotation_angle
 from perception.alternatives import SAME_YAW, Placement, readings, same_reading
-from perception.choice import NEUTRAL, CropContext
+from perception.choice import NEUTRAL, ChoiceWeights, CropContext, gate_evidence
 from perception.covariance import inner_error
-from perception.crop_poses import Candidate, CropPose
+from perception.crop_poses import SAME_PLACE_M, Candidate, CropPose
 from perception.estimates import PerceptionError
 from perception.estimator import NETWORK_FILES, EstimatorConfig, LearnedEstimator
 from perception.faces import FaceTable
@@ -168,6 +168,23 @@ def findings_from_json(content: dict[str, Any]) -> FrameFindings:
     """What ``dataclasses.asdict`` made of findings."""
     crops = tuple(CropFindings(**{**crop, "context": CropContext(**crop["context"])}) for crop in content["crops"])
     return FrameFindings(**{**content, "crops": crops})
+
+
+def winner_of(crop: CropFindings, weights: ChoiceWeights) -> tuple[int, Array, Array]:
+    """Index of a crop's winner, the scores (H,) and the gate's evidence for it, as the pipeline would have them: of a
+    crop that it is sure of it knows the first hypothesis alone. Scores of what it does not know are minus infinity.
+    """
+    evidence = np.array(crop.evidence)
+    known = np.array(crop.first) if crop.sure else np.ones(len(evidence), bool)
+    scores = np.where(known, weights.scores(evidence), -np.inf)
+    best = int(scores.argmax())
+    apart = np.hypot(*(np.array(crop.place) - crop.place[best]).T) > SAME_PLACE_M
+    rivals = ((np.array(crop.reading) != crop.reading[best]) | apart) & known
+    return (
+        best,
+        scores,
+        gate_evidence(scores, np.where(known[:, None], evidence, evidence[best]), best, rivals, crop.context),
+    )
 
 
 def findings_in(estimator: LearnedEstimator, truth: FrameTruth, data: str, domain: str) -> FrameFindings:

@@ -154,11 +154,21 @@ def face_name(part: str, stable_pose: int) -> str:
     return f"{part} {stable_pose}"
 
 
+def part_of(face: str) -> str:
+    """The part of a :func:`face_name`."""
+    return face.rsplit(" ", 1)[0]
+
+
+def noise_of(noise: Mapping[str, NoiseModel], face: str) -> NoiseModel | None:
+    """The noise of a :func:`face_name`, that of its part where there is none; None where nothing is known of it."""
+    return noise.get(face, noise.get(part_of(face)))
+
+
 def with_parts(by_face: Mapping[str, Errors]) -> dict[str, Errors]:
     """Errors by face, and by part those of all its faces."""
     out = dict(by_face)
-    for part in sorted({face.rsplit(" ", 1)[0] for face in by_face}):
-        out[part] = joined([errors for face, errors in by_face.items() if face.rsplit(" ", 1)[0] == part])
+    for part in sorted({part_of(face) for face in by_face}):
+        out[part] = joined([errors for face, errors in by_face.items() if part_of(face) == part])
     return out
 
 

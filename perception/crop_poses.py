@@ -279,14 +279,12 @@ class CropSolver:
         rivals = np.array([not same_reading(self.nets.table, at, c.placement, SAME_PLACE_M) for c in candidates])
         context = view.context
         gate = gate_evidence(scores, evidence, best, rivals, context)
-        probability = float(self.weights.probability_right(gate))
         return CropPose(
             candidates=tuple(candidates),
             scores=scores,
             best=best,
-            probability=probability,
-            # What is right is a part: two models of the same evidence may say otherwise.
-            part_probability=max(float(self.weights.probability_part(gate)), probability),
+            probability=float(self.weights.probability_right(gate)),
+            part_probability=float(self.weights.probability_part(gate)),
             gate_evidence=gate,
             context=context,
             sure=sure and self._borne_out(candidates, scores),

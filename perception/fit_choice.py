@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from cad.spatial import Array
 from perception.alternatives import likely_readings, reading_probabilities
 from perception.bop_files import manifest_hash
-from perception.choice import FEATURES, NEUTRAL, ChoiceWeights, gate_evidence
-from perception.choice_evidence import CropFindings, FrameFindings, collect
+from perception.choice import NEUTRAL, ChoiceWeights
+from perception.choice_errors import errors_in_folds, normalised_errors
+from perception.choice_evidence import CropFindings, FrameFindings, collect, winner_of
 from perception.choice_models import (
     cautious_threshold,
     fit_choice_weights,
@@ -28,8 +29,9 @@ from perception.choice_models import (
     fit_temperature,
     wrong_share_bound,
 )
-from perception.covariance import QUALITIES, Errors, face_name, fit_noise, normalised_squares, shortfall_of
-from perception.crop_poses import SAME_PLACE_M
+from perception.covariance import (
+    fit_noise,
+)
 from perception.estimates import PerceptionError
 from perception.estimator import CHOICE_FILE, EstimatorConfig
 from perception.risk import risk_coverage
@@ -79,23 +81,6 @@ class Winners:
     part_probability: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def winner_of(crop: CropFindings, weights: ChoiceWeights) -> tuple[int, Array, Array]:
-    """Index of a crop's winner, the scores (H,) and the gate's evidence for it, as the pipeline would have them: of a
-    crop that it is sure of it knows the first hypothesis alone. Scores of what it does not know are minus infinity.
-    """
-    evidence = np.array(crop.evidence)
-    known = np.array(crop.first) if crop.sure else np.ones(len(evidence), bool)
-    scores = np.where(known, weights.scores(evidence), -np.inf)
-    best = int(scores.argmax())
-    apart = np.hypot(*(np.array(crop.place) - crop.place[best]).T) > SAME_PLACE_M
-    rivals = ((np.array(crop.reading) != crop.reading[best]) | apart) & known
-    return (
-        best,
-        scores,
-        gate_evidence(scores, np.where(known[:, None], evidence, evidence[best]), best, rivals, crop.context),
-    )
-
-
 def choice_of(crops: Sequence[CropFindings]) -> dict[str, float]:
     """Weights of the choice."""
     shown = [c for c in crops if c.part]
@@ -131,9 +116,7 @@ def cross_fitted(frames: Sequence[Sequence[CropFindings]], folds: int) -> tuple[
             replace(
                 new,
                 probability=weights.probability_right(new.evidence),
-                part_probability=np.maximum(
-                    weights.probability_part(new.evidence), weights.probability_right(new.evidence)
-                ),
+                part_probability=weights.probability_part(new.evidence),
             )
         )
         scores += [winner_of(crop, weights)[1] for crop in mine]
@@ -170,61 +153,8 @@ def fit_weights(findings: Sequence[FrameFindings], config: ChoiceFitConfig) -> t
         temperature=temperature,
         set_mass=mass,
     )
-    weights = replace(weights, noise=fit_noise(_errors_in_folds(findings, weights, config.folds)))
+    weights = replace(weights, noise=fit_noise(errors_in_folds(findings, weights, config.folds)))
     return weights, _figures(findings, ordered, scores, held_out, weights)
-
-
-def errors_by_face(crops: Sequence[CropFindings], weights: ChoiceWeights) -> dict[str, Errors]:
-    """Errors of the winners that are whole and usable, by the part's true face."""
-    columns = [FEATURES.index(name) for name in QUALITIES]
-    rows: dict[str, list[tuple[list[float], list[list[float]], Array, bool]]] = {}
-    for crop in crops:
-        best, _, gate = winner_of(crop, weights)
-        error = crop.errors[best]
-        if not crop.whole or error is None:
-            continue
-        p = float(weights.probability_right(gate))
-        shortfall = shortfall_of([crop.evidence[best][k] for k in columns], p)
-        rows.setdefault(face_name(crop.part, crop.stable_pose), []).append(
-            (error, crop.planar[best], shortfall, p > weights.accept_above)
-        )
-    return {
-        face: Errors(**{name: np.array(column) for name, column in zip(_ERRORS, zip(*found, strict=True), strict=True)})
-        for face, found in sorted(rows.items())
-    }
-
-
-_ERRORS = ("by_cause", "planar", "shortfall", "accepted")
-
-
-def _errors_in_folds(findings: Sequence[FrameFindings], weights: ChoiceWeights, folds: int) -> list[dict[str, Errors]]:
-    return [
-        errors_by_face([crop for frame in findings[k::folds] for crop in frame.crops], weights) for k in range(folds)
-    ]
-
-
-def normalised_errors(
-    findings: Sequence[FrameFindings], weights: ChoiceWeights, folds: int
-) -> dict[str, dict[str, float]]:
-    """How the noise fitted on the other folds holds on the accepted ones of each: by "part, domain" and by part, the
-    number of estimates and the means of the normalised errors squared, ``planar`` (3 when it holds) and ``pose`` (6).
-    """
-    seen: dict[str, list[tuple[float, float]]] = {}
-    errors = _errors_in_folds(findings, weights, folds)
-    for k in range(folds):
-        fitted = fit_noise([fold for i, fold in enumerate(errors) if i != k])
-        for frame in findings[k::folds]:
-            for face, every in errors_by_face(frame.crops, weights).items():
-                own, part = every.take(every.accepted), face.rsplit(" ", 1)[0]
-                noise = fitted.get(face) or fitted.get(part)
-                if noise is not None and len(own):
-                    for pair in zip(*normalised_squares(own, noise), strict=True):
-                        for name in (f"{part}, {frame.domain}", part):
-                            seen.setdefault(name, []).append(pair)
-    return {
-        name: {"n": len(pairs), "planar": float(np.mean(pairs, axis=0)[0]), "pose": float(np.mean(pairs, axis=0)[1])}
-        for name, pairs in sorted(seen.items())
-    }
 
 
 def _prediction_set(crops: Sequence[CropFindings], scores: Sequence[Array], covered: float) -> tuple[float, float]:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from perception.choice import FEATURES, NEUTRAL, CropContext
-from perception.choice_evidence import CropFindings, FrameFindings, collect, findings_from_json
+from perception.choice_errors import normalised_errors
+from perception.choice_evidence import CropFindings, FrameFindings, collect, findings_from_json, winner_of
 from perception.estimates import PerceptionError
 from perception.estimator import EstimatorConfig
-from perception.fit_choice import ChoiceFitConfig, fit_weights, normalised_errors, winner_of
+from perception.fit_choice import ChoiceFitConfig, fit_weights
 
 CONFIG = ChoiceFitConfig(data=(Path("data"),), out=Path("out"), wanted_right=0.98)
 SIGMA = np.array([1e-5, 1e-5, 1e-3, 3e-5, 2e-3, 2e-3])
