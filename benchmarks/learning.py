@@ -71,24 +71,25 @@ def learn(config: Config) -> dict[str, dict[int, dict[str, float]]]:
 
 
 def draw(figures: dict[str, dict[int, dict[str, float]]], config: Config) -> Path:
-    """``learning.png``: errors against images on the left, against minutes on the right."""
+    """``learning.png``: errors against images, and beside them against the minutes of ``curves``."""
     figure = Figure(figsize=(9.0, 3.8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, sharey=True)
+    panels = figure.subplots(1, 2 if config.curves else 1, sharey=True, squeeze=False)[0]
     for network, names in ERRORS.items():
         for label, name in names.items():
             wrong = [1.0 - figures[network][images][name] for images in config.images]
-            left.plot(config.images, wrong, marker="o", label=f"{network}: {label}")
-    left.set(xscale="log", yscale="log", xlabel=f"images, {config.minutes:g} minutes each", ylabel="share on val data")
+            panels[0].plot(config.images, wrong, marker="o", label=f"{network}: {label}")
+    panels[0].set(xscale="log", yscale="log", ylabel="share on validation data")
+    panels[0].set_xlabel(f"images, {config.minutes:g} minutes each")
     for path in config.curves:
-        curves, known = read_curves(path), ERRORS.get(path.stem, {})
-        for label, name in known.items():
+        curves = read_curves(path)
+        for label, name in ERRORS.get(path.stem, {}).items():
             values = curves.get(VALIDATION + name)
             if values is not None:
                 seen = np.isfinite(values)
-                right.plot(curves["minutes"][seen], 1.0 - values[seen], marker=".", label=f"{path.stem}: {label}")
-    right.set(xlabel="minutes of training on all images")
-    for axes in (left, right):
+                panels[1].plot(curves["minutes"][seen], 1.0 - values[seen], marker=".", label=f"{path.stem}: {label}")
+        panels[1].set_xlabel("minutes of training on all images")
+    for axes in panels:
         axes.grid(color="0.92", which="both")
         if axes.lines:
             axes.legend(fontsize=8)
