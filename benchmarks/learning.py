@@ -8,6 +8,7 @@ minutes of runs that are there. A run that was stopped goes on where it was; one
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from benchmarks.tables import Section, show
 from cad.files import replacing
 from perception.bop_files import read_json
 from perception.training_curves import VALIDATION, read_curves
+from twin.robot import TwinError
 from twin.training import LANES
 from twin.training_lanes import run_lanes
 
@@ -118,4 +120,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TwinError as error:
+        sys.exit(f"error: {error}")
